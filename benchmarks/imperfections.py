@@ -103,7 +103,7 @@ def main(
     captures: Sequence[Path],
     *,
     corrected: Annotated[
-        bool, "Ingest with --refine, and fit with --inter-reflection."
+        bool, "Ingest with --refine, and fit with --inter-reflection on."
     ] = False,
     json_: Annotated[Path | None, "File for all results."] = None,
 ) -> None:

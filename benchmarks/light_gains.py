@@ -6,7 +6,8 @@ gains, and effect on the errors.
 Each capture folder has its truth beside it as <folder>.truth.npz (keys of
 skindb.virtual.capture). The captures are ingested into DB; their samples are multiplied
 by random gains and fitted without and with `light_gains`, a tenth of the cameras held
-out. The Markdown table has one row for each capture and size of the gains.
+out. The Markdown table has one row for each capture and size of the gains; its last
+column is what a fit chooses by itself, for gains and inter-reflection.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import xarray as xr
 import skindb
 from benchmarks.truth import read_truth
 from benchmarks.validate import header
-from skindb.fit import FitParameters, fit_model
+from skindb.fit import FitParameters, first_pass, fit_model
 from skindb.virtual.capture import recovered_against_true
 from skindb.workflow import ingest_take
 
@@ -30,6 +31,7 @@ COLUMNS = (
     "residual [%]",
     "normals, without, with [deg]",
     "held-out cameras, without, with [%]",
+    "choice",
 )
 SPREADS = (0.0, 0.05, 0.15)
 
@@ -63,9 +65,10 @@ def main(db: str, captures: Sequence[Path]) -> None:
         )
         for spread in SPREADS:
             gain = 1 + spread * normal
+            wrong = planted(capture, gain)
             models = [
                 fit_model(
-                    planted(capture, gain),
+                    wrong,
                     FitParameters(hold_out_cameras=0.1, light_gains=on),
                 )
                 for on in (False, True)
@@ -85,5 +88,6 @@ def main(db: str, captures: Sequence[Path]) -> None:
                 f"{residual:.1f}",
                 "{:.1f}, {:.1f}".format(*angles),
                 "{:.1f}, {:.1f}".format(*errors),
+                "; ".join(first_pass(wrong).attrs["corrections"].values()),
             )
             print(f"| {folder.name} | {' | '.join(cells)} |", flush=True)

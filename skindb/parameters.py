@@ -155,7 +155,7 @@ def broken_rule(limits: Option, hint: Any, value: Any) -> str:
     words = words_of(hint)
     low = limits.minimum
     high = limits.maximum
-    if value in words:
+    if value in words or (isinstance(value, bool) and bool in get_args(hint)):
         return ""
     if words and low is None:
         return f"must be one of {', '.join(words)}"
@@ -208,10 +208,11 @@ class FitParameters(Limited):
         takes those of `SURFACE_ENERGY`, and with "unknown" nothing is subtracted from R_d.
     light_gains
         Whether samples are first divided by the gain of their light, see
-        `estimate_light_gains`. Lights that are held out have gain 1.
+        `estimate_light_gains`. Lights that are held out have gain 1. "auto" decides by
+        trials, see `skindb.fit.choice.choose_corrections`.
     inter_reflection
         Whether light from other parts of the face after one diffuse bounce is
-        subtracted, see `bounced_light`; the first pass is then repeated.
+        subtracted, see `bounced_light`; the first pass is then repeated. "auto" as above.
     hold_out_lights, hold_out_cameras
         Fractions of lights and cameras that are held out of the fit, to measure the
         error of predictions.
@@ -252,13 +253,13 @@ class FitParameters(Limited):
         minimum=0,
         maximum=0.5,
     )
-    light_gains: bool = option(
-        False,
+    light_gains: bool | Literal["auto"] = option(
+        "auto",
         "Estimate one gain per light and divide its samples by it, for lights of "
         "doubtful intensity.",
     )
-    inter_reflection: bool = option(
-        False,
+    inter_reflection: bool | Literal["auto"] = option(
+        "auto",
         "Subtract inter-reflection between parts of the face (one diffuse bounce).",
     )
     hold_out_lights: float = option(

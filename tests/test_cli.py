@@ -505,11 +505,11 @@ def test_cli__many_takes_at_a_time(tmp_path):
         "V001": 1,
         "V001.lotion": 1,
     }
-    named = _run("fit", db, "V001", "--eta", "1.35", "--light-gains")
+    named = _run("fit", db, "V001", "--eta", "1.35", "--light-gains", "on")
     assert "sigma_tr of cheek: R 0." in named.stdout
     assert "gains of the lights" in named.stdout
     assert "V001: kept from its model: k 2\n" in named.stderr
-    plain = json.loads(_run("fit", db, "V001", "--no-light-gains", "--json").stdout)
+    plain = json.loads(_run("fit", db, "V001", "--light-gains", "off", "--json").stdout)
     parameters = plain["V001"]["parameters"]
     assert (parameters["k"], parameters["eta"]) == (2, 1.35)
     assert not parameters["light_gains"]

@@ -81,7 +81,10 @@ def test_options_of__calls_with_the_record_or_with_what_was_given():
         calls.append(changes)
 
     assert CliRunner().invoke(record, ["--lights", "20", "--subsurface"]).exit_code == 0
-    assert CliRunner().invoke(changed, ["--eta", "1.4", "--light-gains"]).exit_code == 0
+    assert (
+        CliRunner().invoke(changed, ["--eta", "1.4", "--light-gains", "on"]).exit_code
+        == 0
+    )
     assert CliRunner().invoke(changed, ["--eta", "2.5"]).exit_code == 2
     assert calls == [
         SimulationParameters(lights=20, subsurface=True),

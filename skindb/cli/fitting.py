@@ -198,6 +198,9 @@ def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
     ]
     lines += [_suspect_line(entry) for entry in report["suspects"]]
     lines += _energy_lines(report.get("surface_energy", {}))
+    if reasons := report.get("corrections"):
+        choices = [f"{n.replace('_', ' ')} {r}" for n, r in reasons.items()]
+        lines.append(f"  chosen: {'; '.join(choices)}")
     if gains := report.get("light_gains"):
         lines.append(
             f"  gains of the lights: standard deviation {gains['spread']:.1%}; "

@@ -101,6 +101,20 @@ class WordOrNumber(click.ParamType):  # type: ignore[type-arg]
         return converted
 
 
+class Switch(click.Choice[Any]):
+    """on, off, or one of a few words."""
+
+    def __init__(self, words: tuple[str, ...]) -> None:
+        super().__init__([*words, "on", "off"])
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> Any:
+        """Convert to a bool, unless it is a word."""
+        word = super().convert(value, param, ctx)
+        return {"on": True, "off": False}.get(word, word)
+
+
 Command = Callable[..., Any]
 
 
@@ -153,8 +167,6 @@ def _click_option(
     if not limits.show_default:
         settings["show_default"] = False
     name = limits.name or spec.name.replace("_", "-")
-    if unset and default is False:  # a stored parameter may be on
-        name += f"/--no-{name}"
     return click.option(
         f"--{name}", spec.name, **settings, **_kind(hint, limits, default)
     )
@@ -164,6 +176,8 @@ def _kind(hint: Any, limits: Option, default: Any) -> dict[str, Any]:
     """Settings of an option that follow from the type of its field."""
     if words_of(hint) and limits.minimum is not None:
         return {"type": WordOrNumber(hint, limits)}
+    if words_of(hint) and bool in get_args(hint):
+        return {"type": Switch(words_of(hint))}
     kind = get_args(hint)[0] if isinstance(hint, UnionType) else hint
     if kind is bool and default is True:  # the option switches it off
         return {"is_flag": True, "flag_value": False, "show_default": False}

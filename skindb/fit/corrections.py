@@ -249,30 +249,41 @@ def bounced_light(
     ).astype(np.float32)
     scene = RayScene(position, triangles)
     rays = _cosine_rays()
-    square = np.square(position[:, None] - light).sum(axis=2)
-    lit = cosines(normal, directions(position, light))
+    wanted = np.arange(len(position))[receivers]
+    parts = [
+        wanted[begin : begin + SURFELS_PER_BLOCK]
+        for begin in range(0, len(wanted), SURFELS_PER_BLOCK)
+    ]
+    meetings = [
+        _meetings(scene, position[part], normal[part], rays, triangles, normal, eta)
+        for part in parts
+    ]
+    met = np.concatenate([np.zeros(0, np.int64), *(met for _, met, _ in meetings)])
+    senders = np.unique(met)
+    # transmitted light of each lamp over its intensity
+    lit = cosines(normal[senders], directions(position[senders], light))
     enters = (
         np.maximum(lit, 0)
         * fresnel_transmittance(np.clip(lit, 1e-3, 1), eta)
-        * np.nan_to_num(visible)
+        * np.nan_to_num(visible[senders])
     )
-    # transmitted light of each lamp over its intensity
-    sent = (enters / square).astype(np.float32)
-    wanted = np.arange(len(position))[receivers]
+    sent = (enters / _square_distance(position[senders], light)).astype(np.float32)
     out = np.zeros((len(wanted), len(light), reflectance.shape[1]), np.float32)
-    for begin in range(0, len(wanted), SURFELS_PER_BLOCK):
-        part = wanted[begin : begin + SURFELS_PER_BLOCK]
-        receiver, met, weight = _meetings(
-            scene, position[part], normal[part], rays, triangles, normal, eta
-        )
+    begin = 0
+    for part, (receiver, met, weight) in zip(parts, meetings, strict=True):
+        column = np.searchsorted(senders, met)
+        square = _square_distance(position[part], light)
         for c in range(reflectance.shape[1]):
-            shape = (len(part), len(position))
-            out[begin : begin + len(part), :, c] = (
-                csr_array((weight * reflectance[met, c], (receiver, met)), shape=shape)
-                @ sent
-                * square[part]
-            )
+            entries = (weight * reflectance[met, c], (receiver, column))
+            gathered = csr_array(entries, shape=(len(part), len(senders))) @ sent
+            out[begin : begin + len(part), :, c] = gathered * square
+        begin += len(part)
     return out
+
+
+def _square_distance(points: Array, light: Array) -> Array:
+    """(n, l) squared distances in mm^2."""
+    return np.asarray(np.square(points[:, None] - light).sum(axis=2))
 
 
 def without_bounce(

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.fit.albedo import estimate_diffuse_reflectance
+from skindb.fit.choice import choose_corrections
 from skindb.fit.corrections import (
     bounced_light,
     divided_by_gains,
@@ -123,6 +124,10 @@ def first_pass(
         surface = surface_of(samples, parameters, dictionary)
         plan = plan_fit(capture, parameters, dictionary=dictionary)
     held_out = hold_out(capture, plan, parameters)
+    with timer.stage("choice of corrections"):
+        parameters, reasons = choose_corrections(
+            capture, samples, held_out, parameters, _fit_surfels
+        )
     if parameters.light_gains:
         with timer.stage("light gains"):
             gains = _training_gains(samples, held_out, parameters)
@@ -144,6 +149,7 @@ def first_pass(
     first = xr.DataTree.from_dict({"fitted": fitted, "held_out": held_out, **groups})
     first.attrs = surface.provenance | {
         "parameters": parameters.as_dict() | surface.settings,
+        "corrections": reasons,
         "seconds": timer.seconds,
         "skipped": plan.explain() if plan.omissions else [],
     }
@@ -253,6 +259,7 @@ def second_pass(
         "surface_energy": energy,
         **{name: float(groups["fitted"][name]) for name in EVEN},
         "suspects": suspects(outliers, fitted_part(samples, held_out)),
+        "corrections": first.attrs["corrections"],
         "skipped": first.attrs["skipped"],
         "seconds": {**first.attrs["seconds"], **timer.seconds},
     }

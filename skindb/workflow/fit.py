@@ -286,8 +286,9 @@ def kept_parameters(db: Database, take: str, changes: Mapping[str, Any]) -> list
         return []
     values = _values_of_model(db.record("model", take).provenance, changes)
     default = FitParameters().as_dict()
+    words = {"True": "on", "False": "off"}
     return [
-        f"{name} {value}"
+        f"{name} {words.get(str(value), value)}"
         for name, value in values.items()
         if name not in changes and value != default[name]
     ]

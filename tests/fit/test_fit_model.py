@@ -34,7 +34,14 @@ from skindb.reflectance.mixture import Mixture
 from skindb.render.scene import from_model
 from skindb.schema import GROUPS, FitStatus, check, dataset, label
 
-STAGES = {"dictionary", "first pass", "reduced basis", "second pass", "translucency"}
+STAGES = {
+    "dictionary",
+    "choice of corrections",
+    "first pass",
+    "reduced basis",
+    "second pass",
+    "translucency",
+}
 HELD_OUT = FitParameters(
     k=3,
     rank=6,
@@ -138,8 +145,11 @@ def test_fit_model__report(fitted):
     )
     assert tabulate_translucency(attrs) == tabulate_translucency(sites)
     assert any("2 of 40 are skipped" in line for line in attrs["skipped"])
-    assert attrs["parameters"] == HELD_OUT.as_dict()
-    assert FitParameters.of(attrs) == HELD_OUT
+    # a capture of 40 surfels supports no corrections
+    neither = {"light_gains": False, "inter_reflection": False}
+    assert attrs["parameters"] == HELD_OUT.as_dict() | neither
+    assert attrs["corrections"].keys() == neither.keys()
+    assert FitParameters.of(attrs) == replace(HELD_OUT, **neither)
     assert attrs["consent_scope"] == ["fit"]
     assert {stage for stage, done, total in steps if done == total} == STAGES
     assert all(0 <= done <= total for _, done, total in steps)

@@ -45,7 +45,8 @@ def test_fit_take__commits_the_model_and_its_provenance(
     assert (record.kind, record.take, record.generation) == ("model", "S1", 1)
     assert db.verify() == []
     attrs = db.read("model", "S1").attrs
-    assert attrs["parameters"] == SMALL.as_dict()
+    neither = {"light_gains": False, "inter_reflection": False}
+    assert attrs["parameters"] == SMALL.as_dict() | neither
     assert attrs["seeds"] == {"fit": 0}
     assert attrs["command"] == "fit"
     assert attrs["inputs"] == [db.record("capture", "S1").as_input()]
@@ -143,6 +144,9 @@ def test_parameters_of__another_surface_drops_what_mixtures_have(three):
     assert parameters_of(three, "S2", {"surface": "ggx"}) == ggx
     assert kept_parameters(three, "S2", {"surface": "ggx"}) == ["eta 1.35"]
     assert kept_parameters(three, "S3", {}) == []
+    fit_take(three, "S3", FitParameters(k=1, rank=6, light_gains=False))
+    kept = ["k 1", "rank 6", "light_gains off"]
+    assert kept_parameters(three, "S3", {}) == kept
 
 
 def test_takes_to_fit__a_changed_kernel_or_capture_is_a_reason_to_refit(
