@@ -204,7 +204,7 @@ class FitParameters(Limited):
         Refractive index of skin.
     surface_energy, surface_energy_error
         Mean and standard deviation of the prior for the fraction of light that the
-        surface reflects in total, see `skindb.fit.energy.even_reflection`; "condition"
+        surface reflects in total, see `skindb.fit.energy`; "condition"
         takes those of `SURFACE_ENERGY`, and with "unknown" nothing is subtracted from R_d.
     light_gains
         Whether samples are first divided by the gain of their light, see
@@ -242,8 +242,8 @@ class FitParameters(Limited):
     eta: float = option(1.3, "Refractive index of skin.", minimum=1.0, maximum=2.0)
     surface_energy: float | Literal["condition", "unknown"] = option(
         "condition",
-        "Fraction of light that the surface reflects in total; what highlights do not "
-        "show of it is subtracted from R_d.",
+        "Fraction of light that the surface reflects in total, a prior of the even "
+        "part that photographs do not show; unknown: R_d keeps it.",
         minimum=0,
         maximum=0.5,
     )

@@ -28,11 +28,17 @@ from skindb.schema.declaration import LARGEST_R_D, SMALLEST_R_D
 # Quantile of R_d in blue over the surfels, which bounds even reflection: moles and brows
 # reflect little else. The darkest hundredth may be wrong by noise and shadows.
 DARKEST = 0.01
-# standard deviations by which the highlights may exceed the prior of the total
-MAX_DEVIATIONS = 2.0
+# Standard deviations by which the highlights may exceed the prior of the total. They show
+# half to nine tenths of it; above one deviation (lotion, coloured lobes) R_d was wrong by
+# 0.026, with either sign.
+MAX_DEVIATIONS = 1.0
 # Error of R_d relative to it, by lobes of other shapes: R_d was 1.7 to 2.6 % too low in
 # proportion in four captures without other errors.
 PROPORTIONAL_ERROR = 0.02
+# Of R_d that was estimated together with nearly even lobes, by light that these confuse
+# with it. In five captures R_d was 0.003 too high to 0.010 too low, whatever the lobes
+# lacked (0.002 to 0.021): to subtract this from R_d doubled its error.
+JOINT_ERROR = 0.01
 # error of what highlights do not show without a prior of the total: highlights of bare
 # skin show the half of it, more or less
 UNKNOWN_ERROR = SURFACE_ENERGY["normal"][0] / 2
@@ -76,7 +82,11 @@ def crossed_gloss(lumitexels: xr.Dataset, eta: float) -> float | None:
 
 
 def without_even_reflection(
-    fitted: xr.Dataset, prior: Energy | None, leak: float | None = None
+    fitted: xr.Dataset,
+    prior: Energy | None,
+    leak: float | None = None,
+    *,
+    jointly: bool = False,
 ) -> tuple[xr.Dataset, dict[str, Any]]:
     """Subtract from R_d what the surface reflects evenly and without colour.
 
@@ -89,6 +99,9 @@ def without_even_reflection(
     leak
         From `crossed_gloss`; if it is given, R_d contains only this fraction of the even
         reflection, and nothing is subtracted.
+    jointly
+        Whether R_d was estimated together with lobes that are nearly even: nothing is
+        subtracted, as these already took it from R_d.
 
     Returns
     -------
@@ -99,10 +112,11 @@ def without_even_reflection(
         error. It is negative if the fitted lobes reflect too much, which R_d then
         lacks. It is subtracted from R_d, and `dipole_s` follows. Without a prior, or if
         the highlights contradict it, nothing is subtracted. Its error and 0.02 R_d are
-        added to the total error of R_d, in quadrature.
+        added to the total error of R_d, in quadrature. If R_d was estimated jointly,
+        the error is that of the prior and of the joint fit together.
     summary
         Attribute `surface_energy` of the model: prior, what the highlights show, and
-        whether they contradict it, which they do above two standard deviations.
+        whether they contradict it, which they do above one standard deviation.
     """
     good = fitted[variables.FIT_STATUS].values == FitStatus.FITTED
     good &= np.isfinite(fitted[variables.SURFACE_REFLECTANCE].values)
@@ -119,7 +133,9 @@ def without_even_reflection(
     elif prior is not None:
         contradicted = seen > prior.mean + MAX_DEVIATIONS * prior.error
         summary |= prior._asdict() | {"contradicted": contradicted}
-        if not contradicted:
+        if jointly and not contradicted:
+            error = prior.error * JOINT_ERROR / np.hypot(prior.error, JOINT_ERROR)
+        elif not contradicted:
             largest = float(np.quantile(diffuse[good, 2], DARKEST))
             even, error = min(prior.mean - seen, largest), prior.error
     lower = np.clip(diffuse - even, SMALLEST_R_D, LARGEST_R_D)

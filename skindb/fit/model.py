@@ -244,7 +244,10 @@ def second_pass(
     groups = _groups(capture, fitted.assign(judged), basis, gains)
     prior = energy_prior(str(capture.attrs.get("condition", "normal")), parameters)
     groups["fitted"], energy = without_even_reflection(
-        groups["fitted"], prior, crossed_gloss(samples, parameters.eta)
+        groups["fitted"],
+        prior,
+        crossed_gloss(samples, parameters.eta),
+        jointly=parameters.as_dict().get("stages") == "joint",
     )
     groups |= {"held_out": held_out, "outliers": outliers}
     if "probe" in groups:

@@ -101,9 +101,18 @@ def test_energy_prior__by_condition_or_as_stated():
 def test_without_even_reflection__lobes_that_reflect_too_much_return_it(diffuse):
     """R_d lacks 0.01 that the lobes took from it."""
     planted = _planted(diffuse - 0.025)
-    fitted, summary = without_even_reflection(planted, Energy(0.015, 0.006))
+    fitted, summary = without_even_reflection(planted, Energy(0.015, 0.011))
     assert not summary["contradicted"]
     np.testing.assert_allclose(fitted["diffuse_reflectance"], diffuse, atol=1e-5)
+
+
+def test_without_even_reflection__lobes_of_a_joint_fit_took_it_already(diffuse):
+    planted = _planted(diffuse)
+    fitted, summary = without_even_reflection(planted, Energy(0.04, 0.01), jointly=True)
+    assert fitted["even_reflection"] == 0
+    # of two measurements with an error of 0.01 each
+    assert fitted["even_reflection_error"] == pytest.approx(0.01 / np.sqrt(2))
+    assert not summary["contradicted"]
 
 
 def test_without_even_reflection__crossed_polarisers_leave_little_of_it(diffuse):
