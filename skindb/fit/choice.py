@@ -35,6 +35,10 @@ MIN_CAMERAS = 4
 MIN_SURFELS = 300
 MIN_SAMPLES = 16  # of a surfel
 MAX_SURFELS = 1200  # a trial of these takes 4 % of the first pass of 30,000
+# Runs of surfels that are read, since a part of a stored chunk cannot be; 20 runs are a
+# seventh of the samples of 37,000 surfels.
+PATCH = 256
+MAX_PATCHES = 20
 MAX_SURFELS_GAINS = 250
 HELD_OUT_FRACTION = 0.2
 # Standard deviation of gains that turned normals do not explain. Estimates for correct
@@ -186,9 +190,10 @@ def choose_corrections(
         inter_reflection=parameters.inter_reflection is True,
     )
     training = fitted_part(samples, held_out)
-    usable = np.flatnonzero(
-        capture["samples"].to_dataset()["sample_count"].values >= MIN_SAMPLES
-    )
+    count = capture["samples"].to_dataset()["sample_count"].values
+    patches = _patches(len(count))
+    near = np.concatenate([np.arange(p.start, p.stop) for p in patches])
+    usable = near[count[near] >= MIN_SAMPLES]
     counts = training.sizes["light"], training.sizes["camera"], len(usable)
     if any(
         n < m
@@ -202,13 +207,29 @@ def choose_corrections(
         return off, dict.fromkeys(undecided, reason)
     rng = np.random.default_rng([parameters.seed, STREAM])
     surfels = np.sort(rng.permutation(usable)[:MAX_SURFELS])
-    few = training.isel(surfel=surfels).compute()
+    few = _read(training, patches).isel(surfel=np.searchsorted(near, surfels))
     flags = {
         f"{dim}_held_out": _drawn(few.sizes[dim], rng) for dim in ("light", "camera")
     }
     lights = np.flatnonzero(held_out["light_held_out"].values == 0)
     trial = Trial(capture, training, lights, surfels, dataset(flags), parameters, fit)
     return _tried(trial, few, undecided, off)
+
+
+def _patches(surfels: int) -> list[slice]:
+    """Runs of surfels, evenly over the order in which they are stored."""
+    last = max(surfels - 1, 0) // PATCH
+    chosen = np.unique(np.linspace(0, last, min(MAX_PATCHES, last + 1)).astype(np.intp))
+    return [slice(PATCH * k, min(PATCH * (k + 1), surfels)) for k in chosen.tolist()]
+
+
+def _read(samples: xr.Dataset, patches: list[slice]) -> xr.Dataset:
+    """The samples of runs of surfels, in memory."""
+    # together, Dask would read the blocks around them
+    parts = [samples.isel(surfel=patch).compute() for patch in patches]
+    return xr.concat(
+        parts, "surfel", data_vars="minimal", coords="minimal", compat="override"
+    )
 
 
 def _tried(
