@@ -4,7 +4,6 @@ if it improves predictions of lights and cameras that are held out for this choi
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -12,6 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from skindb.fit.albedo import estimate_diffuse_reflectance
 from skindb.fit.corrections import (
     bounced_light,
     divided_by_gains,
@@ -19,11 +19,11 @@ from skindb.fit.corrections import (
     without_bounce,
 )
 from skindb.fit.lumitexels import directions
+from skindb.fit.normals import estimate_normals
 from skindb.fit.plan import fitted_part, surface_of
 from skindb.fit.quality import HELD_OUT_ERRORS
-from skindb.fit.surface import held_out_error
+from skindb.fit.surface import fit_surface, held_out_error
 from skindb.parameters import FitParameters
-from skindb.reflectance.model import ReflectanceModel
 from skindb.schema import dataset
 from skindb.types import Array
 
@@ -54,8 +54,6 @@ BOUNCED_QUANTILE = 0.75
 MIN_BOUNCED = 1e-3  # of the RMS of the samples
 MIN_SURFELS_BOUNCE = 50
 
-Fit = Callable[[xr.Dataset, ReflectanceModel, FitParameters], xr.Dataset]
-
 
 class Change(NamedTuple):
     """Mean relative change of the errors by a correction, and its standard error."""
@@ -82,15 +80,21 @@ class Trial:
     surfels: NDArray[np.intp]  # indices of the sample
     held_out: xr.Dataset
     parameters: FitParameters
-    fit: Fit
 
     def errors(self, few: xr.Dataset) -> tuple[dict[str, Array], xr.Dataset]:
         """RMS errors [sr^-1] of the surfels at held-out lights and at held-out cameras,
-        and their fit by one GGX lobe.
+        and their fit, stage after stage, by one GGX lobe.
         """
         one_lobe = FitParameters(surface="ggx", eta=self.parameters.eta)
         surface = surface_of(few, one_lobe, None)
-        fitted = self.fit(fitted_part(few, self.held_out), surface, one_lobe)
+        part = fitted_part(few, self.held_out)
+        fitted = estimate_normals(part, eta=one_lobe.eta)
+        fitted = fitted.merge(
+            estimate_diffuse_reflectance(part.merge(fitted), eta=one_lobe.eta)
+        )
+        fitted = fitted.merge(
+            fit_surface(part.merge(fitted), surface=surface, eta=one_lobe.eta)
+        )
         weighted = fitted.merge(few[["surfel_area"]])
         basis = surface.reduced(weighted, k=1, rng=np.random.default_rng(0))
         names = ("shading_normal", "diffuse_reflectance", *surface.parameter_variables)
@@ -154,7 +158,6 @@ def choose_corrections(
     samples: xr.Dataset,
     held_out: xr.Dataset,
     parameters: FitParameters,
-    fit: Fit,
 ) -> tuple[FitParameters, dict[str, str]]:
     """Decide which corrections improve the fit of a take.
 
@@ -166,8 +169,6 @@ def choose_corrections(
         Lights and cameras held out of the fit, which contribute nothing.
     parameters
         Only the corrections that are "auto" are chosen.
-    fit
-        Fits a surface model to all surfels of a Dataset.
 
     Returns
     -------
@@ -212,7 +213,7 @@ def choose_corrections(
         f"{dim}_held_out": _drawn(few.sizes[dim], rng) for dim in ("light", "camera")
     }
     lights = np.flatnonzero(held_out["light_held_out"].values == 0)
-    trial = Trial(capture, training, lights, surfels, dataset(flags), parameters, fit)
+    trial = Trial(capture, training, lights, surfels, dataset(flags), parameters)
     return _tried(trial, few, undecided, off)
 
 

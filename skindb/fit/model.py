@@ -125,9 +125,7 @@ def first_pass(
         plan = plan_fit(capture, parameters, dictionary=dictionary)
     held_out = hold_out(capture, plan, parameters)
     with timer.stage("choice of corrections"):
-        parameters, reasons = choose_corrections(
-            capture, samples, held_out, parameters, _fit_surfels
-        )
+        parameters, reasons = choose_corrections(capture, samples, held_out, parameters)
     if parameters.light_gains:
         with timer.stage("light gains"):
             gains = _training_gains(samples, held_out, parameters)

@@ -13,7 +13,7 @@ from skindb.fit import choice as choice_module
 from skindb.fit.choice import Change, choose_corrections
 from skindb.fit.corrections import without_bounce
 from skindb.fit.lumitexels import lumitexels
-from skindb.fit.model import _fit_surfels, first_pass
+from skindb.fit.model import first_pass
 from skindb.fit.plan import hold_out, plan_fit
 from skindb.schema import label
 
@@ -30,9 +30,7 @@ def _choose(skin, parameters=None):
     parameters = parameters or FitParameters()
     capture = capture_of(skin, probe=False)
     held_out = hold_out(capture, plan_fit(capture, parameters), parameters)
-    return choose_corrections(
-        capture, lumitexels(capture), held_out, parameters, _fit_surfels
-    )
+    return choose_corrections(capture, lumitexels(capture), held_out, parameters)
 
 
 def _with_samples(skin, values):
