@@ -39,6 +39,7 @@ from skindb.fit import (
     estimate_normals,
     fit_surface,
     reduce_basis,
+    refine_jointly,
     refit,
 )
 from skindb.optics.angles import half_difference
@@ -112,6 +113,9 @@ def skindb_fit(photographs: Photographs, training: Mask, *, eta: float) -> Fitte
         estimate_normals(samples, eta=eta, scan_error=NO_SCAN_DEGREES)
     )
     samples = samples.merge(estimate_diffuse_reflectance(samples, eta=eta))
+    samples = samples.assign(
+        refine_jointly(samples, eta=eta, scan_error=NO_SCAN_DEGREES)
+    )
     surface = fit_surface(samples, surface=Mixture.of_dictionary(dictionary), eta=eta)
     basis = reduce_basis(
         surface.merge(samples), dictionary=dictionary, rng=np.random.default_rng(1)

@@ -4,6 +4,7 @@ translucency.
 
 from skindb.fit.albedo import estimate_diffuse_reflectance
 from skindb.fit.corrections import estimate_light_gains
+from skindb.fit.joint import refine_jointly
 from skindb.fit.lumitexels import lumitexels, sample_variance
 from skindb.fit.model import first_pass, fit_model, second_pass
 from skindb.fit.normals import estimate_normals
@@ -48,6 +49,7 @@ __all__ = [
     "prediction_table",
     "read_dictionary",
     "reduce_basis",
+    "refine_jointly",
     "refit",
     "sample_variance",
     "second_pass",

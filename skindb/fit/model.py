@@ -26,6 +26,7 @@ from skindb.fit.corrections import (
     without_bounce,
 )
 from skindb.fit.energy import crossed_gloss, energy_prior, without_even_reflection
+from skindb.fit.joint import refine_jointly
 from skindb.fit.lumitexels import lumitexels
 from skindb.fit.normals import estimate_normals
 from skindb.fit.plan import fitted_part, hold_out, plan_fit, surface_of
@@ -182,6 +183,10 @@ def _fit_surfels(
     estimates = estimate_normals(samples, eta=eta)
     diffuse = estimate_diffuse_reflectance(samples.merge(estimates), eta=eta)
     estimates = estimates.merge(diffuse)
+    if parameters.stages == "joint":
+        estimates = refine_jointly(samples.merge(estimates), eta=eta).merge(
+            estimates, compat="override"
+        )
     terms = fit_surface(
         samples.merge(estimates), surface=surface, mode=parameters.mode, eta=eta
     )
@@ -245,7 +250,7 @@ def second_pass(
         groups["fitted"],
         prior,
         crossed_gloss(samples, parameters.eta),
-        jointly=parameters.as_dict().get("stages") == "joint",
+        jointly=parameters.stages == "joint",
     )
     groups |= {"held_out": held_out, "outliers": outliers}
     if "probe" in groups:

@@ -26,6 +26,7 @@ from skindb.fit.lumitexels import (
 from skindb.fit.quality import HELD_OUT_ERRORS, misfits
 from skindb.reflectance.kinds import surface_model
 from skindb.reflectance.model import (
+    MIN_LOBE_WIDTH,
     Comparison,
     JudgedFit,
     Judgement,
@@ -48,6 +49,7 @@ def fit_surface(
     surface: ReflectanceModel,
     mode: str = "perceptual",
     eta: float = 1.3,
+    min_width: float = MIN_LOBE_WIDTH,
 ) -> xr.Dataset:
     """Fit a surface model to every surfel, before the parts common to all surfels are known.
 
@@ -64,6 +66,9 @@ def fit_surface(
         are mixed, and the prediction is the cube of the mixture.
     eta
         Refractive index of the diffuse term that is subtracted.
+    min_width
+        Half width of the narrowest lobe of a surfel, over the smallest angle at which it
+        was seen between its normal and a half vector; 0 allows lobes of any width.
 
     Returns
     -------
@@ -74,7 +79,7 @@ def fit_surface(
         `fit_status`; NaN where the status says that nothing was fitted.
     """
     check(lumitexels, NEEDED, where="lumitexels")
-    comparison = Comparison(mode, eta, noise_floor(lumitexels), MIN_SAMPLES)
+    comparison = Comparison(mode, eta, noise_floor(lumitexels), MIN_SAMPLES, min_width)
     noise = take_noise(lumitexels)
     names = _unique(*NEEDED, *noise_inputs(lumitexels))
 
@@ -106,6 +111,7 @@ def refit(
     basis: xr.Dataset,
     mode: str = "perceptual",
     eta: float = 1.3,
+    min_width: float = MIN_LOBE_WIDTH,
 ) -> xr.Dataset:
     """Parameters of every surfel for the surface model of a take.
 
@@ -116,7 +122,7 @@ def refit(
         `diffuse_reflectance_error` and `normal_error` where they are given.
     basis
         Group "basis" of a model, such as `basis_brdf` of k components from `reduce_basis`.
-    mode, eta
+    mode, eta, min_width
         As in `fit_surface`; not "paper", whose mixtures are not BRDFs that could be reduced.
 
     Returns
@@ -130,7 +136,7 @@ def refit(
         are above 0: they are too small for lobes so sharp that only a few samples see
         them, and for weights that noise moves to their bound.
     """
-    return _judged(lumitexels, basis, mode=mode, eta=eta).surfels
+    return _judged(lumitexels, basis, mode=mode, eta=eta, min_width=min_width).surfels
 
 
 def held_out_error(
@@ -274,6 +280,7 @@ def _judged(
     mode: str,
     eta: float,
     min_samples: int = MIN_SAMPLES,
+    min_width: float = MIN_LOBE_WIDTH,
     evaluate: bool = False,
     held: NDArray[np.int64] | None = None,
     outliers: bool = False,
@@ -288,7 +295,7 @@ def _judged(
     errors = () if evaluate else tuple(n for n in ERROR_INPUTS if n in lumitexels)
     names = _unique(*NEEDED, *noise_inputs(lumitexels), *parameter_names, *errors)
     check(lumitexels, (*NEEDED, *parameter_names), where="lumitexels")
-    comparison = Comparison(mode, eta, noise_floor(lumitexels), min_samples)
+    comparison = Comparison(mode, eta, noise_floor(lumitexels), min_samples, min_width)
     noise = take_noise(lumitexels)
 
     def judge(part: xr.Dataset) -> tuple[dict[str, Array], NDArray[np.int64]]:

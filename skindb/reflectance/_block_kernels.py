@@ -16,6 +16,7 @@ from skindb.reflectance._lumitexel_kernels import (
     FEW,
     FITTED,
     MIN_COSINE_SURFACE,
+    OUTLIER_SPREAD,
     PAPER,
     PERCEPTUAL,
     JudgedErrors,
@@ -31,10 +32,12 @@ from skindb.reflectance._lumitexel_kernels import (
     polarise_rows,
     prepare,
     relative_drift,
+    smallest_half_angle,
     split_diffuse,
     surface_factor,
     turned_normals,
     weigh,
+    weigh_outliers,
     write_cosines,
     write_rows,
 )
@@ -60,6 +63,7 @@ class Tables(NamedTuple):
 
     table: Tensor32  # (nh, nd, np, width) padded with zeros
     lift: Matrix  # (r, m) from the space of the tables; square: the identity
+    half_width: Vector  # (m,) at half maximum, as an angle of the half vector [rad]
 
 
 @kernel
@@ -99,9 +103,21 @@ def _fit_rows(
 
 
 @kernel
+def _block_narrow(
+    half_width: Vector, count: int, ratio: float, b: Lumitexel, work: FitMemory
+) -> None:
+    """Block the columns whose peak no chosen sample shows, except the widest."""
+    limit = ratio * smallest_half_angle(count, b)
+    limit = min(limit, half_width.max())
+    for j in range(half_width.shape[0]):
+        work.blocked[j] = half_width[j] < limit
+
+
+@kernel
 def fit_block(block: Block, tables: Tables, options: Options, out: SurfaceFit) -> None:
     """Fit, or only evaluate, every surfel of a block by the dictionary."""
-    table, lift = tables
+    table = tables.table
+    lift = tables.lift
     b = block_memory(block, table.shape[3])
     work = fit_memory(b.pairs.shape[0], table.shape[3], lift.shape[1])
     for s in range(block.position.shape[0]):
@@ -118,10 +134,18 @@ def fit_block(block: Block, tables: Tables, options: Options, out: SurfaceFit) -
         if options.mode == PAPER:
             _cube_roots(count, b)
         x = out.parameters[s]
+        _block_narrow(tables.half_width, count, options.min_width, b, work)
         if options.solve:
             out.kkt[s], out.iterations[s], converged, out.condition[s] = _fit_rows(
                 count, lift, options, x, b, work
             )
+            if options.mode == PERCEPTUAL:
+                predict(b.rows, count, coefficients(lift, x), b.surface, work.single)
+                weigh_outliers(count, options, b, work.root)
+                out.kkt[s], more, converged, out.condition[s] = fit_one(
+                    _problem(count, lift, options, b), x, work
+                )
+                out.iterations[s] += more
             out.status[s] = fitted_status(converged, block.diffuse[s])
         predict(b.rows, count, coefficients(lift, x), b.surface, work.single)
         if options.mode == PAPER:
@@ -158,6 +182,10 @@ def _write_covariance(
         out.covariance[s],
         work,
     )
+    if options.mode == PERCEPTUAL:
+        for j in range(out.covariance.shape[1]):
+            for k in range(out.covariance.shape[1]):
+                out.covariance[s, j, k] *= OUTLIER_SPREAD
 
 
 @kernel
@@ -227,7 +255,8 @@ def judge_block(
 
     The lift (m, m) is the identity. Every block of samples is read only once.
     """
-    table, lift = tables
+    table = tables.table
+    lift = tables.lift
     b = block_memory(block, table.shape[3])
     work = fit_memory(b.pairs.shape[0], table.shape[3], lift.shape[1])
     kinds = held_kinds(errors.held)
@@ -246,8 +275,13 @@ def judge_block(
             continue
         split_diffuse(block.diffuse[s], count, b)
         weigh(s, count, block.noise, options, b)
+        _block_narrow(tables.half_width, count, options.min_width, b, work)
         if options.solve:
             _fit_rows(count, lift, options, x, b, work)
+            if options.mode == PERCEPTUAL:
+                predict(b.rows, count, x, b.surface, work.single)
+                weigh_outliers(count, options, b, work.root)
+                fit_one(_problem(count, lift, options, b), x, work)
         predict(b.rows, count, x, b.surface, work.single)
         if out.counts.shape[2] > 0:
             out.outlier[s] = outliers(count, options, b, work.root, out.counts)

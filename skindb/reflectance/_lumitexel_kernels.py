@@ -50,6 +50,11 @@ LINEAR, PERCEPTUAL, PAPER = range(3)
 # hidden lights, lobes outside the basis); with 4 scales twice as many would be
 # outliers; halved samples are at 25
 OUTLIER_SCALES = 5.0
+# scales of the residuals from which samples have no weight
+OUTLIER_LIMIT = 6.0
+# Variance of a fit with these weights over that from its weighted residuals, for normal
+# noise: (E[w] / E[d(w z)/dz])^2 with w = (1 - z^2/36)^2, (0.947 / 0.845)^2.
+OUTLIER_SPREAD = 1.255
 BINS_PER_SCALE = 16  # of the histograms of scaled residuals
 # smallest scale relative to the cube root of the surfel's mean: samples within 1.5 % of
 # it are not outliers
@@ -70,6 +75,7 @@ class Options(NamedTuple):
     floor: float  # sr^-1
     min_samples: int
     solve: bool  # otherwise the given parameters are only evaluated
+    min_width: float = 0.0  # as in `Comparison`
 
 
 class JudgedErrors(NamedTuple):
@@ -364,6 +370,21 @@ def write_samples(b: Lumitexel) -> int:
 
 
 @kernel
+def smallest_half_angle(count: int, b: Lumitexel) -> float:
+    """Smallest angle [rad] between the normal and a half vector of the chosen samples."""
+    nearest = 0.0
+    for r in range(count):
+        i = b.pairs[r, 0]
+        o = b.pairs[r, 1]
+        both = 0.0
+        for k in range(3):
+            both += b.to_light[i, k] * b.to_camera[o, k]
+        along = (b.lit[i] + b.seen[o]) ** 2
+        nearest = max(nearest, along / max(2.0 + 2.0 * both, 1e-12))
+    return math.acos(math.sqrt(min(nearest, 1.0)))
+
+
+@kernel
 def write_noise(surfel: int, count: int, noise: Noise, b: Lumitexel) -> bool:
     """Write the variance of one channel of the chosen samples, linear in reflectance;
     returns whether it is known.
@@ -528,6 +549,29 @@ def outliers(
             counts[b.pairs[r, 0], b.pairs[r, 1], place] += 1
             beyond += place == last
     return beyond / steep
+
+
+@kernel
+def weigh_outliers(
+    count: int, options: Options, b: Lumitexel, root: RootMemory
+) -> None:
+    """Multiply the weights of the samples by Tukey's weights of their residuals in
+    cube-root space, for the surface in `b.surface`.
+    """
+    mean = _root_residuals(count, np.float32(options.floor), b, root)
+    for r in range(count):
+        root.trial[r] = abs(root.trial[r]) * math.sqrt(b.weight[r])
+        root.square[r] = root.trial[r]
+    level = max(mean, options.floor)
+    finest = (
+        MIN_ROOT_SCALE * level / np.cbrt(level * level + options.floor * options.floor)
+    )
+    scale = 1.4826 * median_of(root.square, root.square_bits, count, count)
+    limit = OUTLIER_LIMIT * max(scale, finest)
+    for r in range(count):
+        z = root.trial[r] / limit
+        w = max(1.0 - z * z, 0.0)
+        b.weight[r] *= w * w
 
 
 @fast_kernel

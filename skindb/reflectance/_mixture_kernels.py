@@ -30,6 +30,7 @@ from skindb.reflectance._lumitexel_kernels import (
 )
 from skindb.reflectance.model import SurfaceFit
 from skindb.types import (
+    BoolVector,
     IntVector,
     Matrix,
     Matrix32,
@@ -65,6 +66,7 @@ class FitMemory(NamedTuple):
     moved: Vector  # (m,) weights of a step
     block: Matrix32  # (LANES + 1, LANES) sums in vector registers
     single: Vector32  # (width,) coefficients in single precision
+    blocked: BoolVector  # (m,) columns whose weight is zero
 
 
 @kernel
@@ -85,6 +87,7 @@ def fit_memory(size: int, width: int, m: int) -> FitMemory:
         np.empty(m),
         np.empty((LANES + 1, LANES), np.float32),
         np.zeros(width, np.float32),
+        np.zeros(m, np.bool_),
     )
 
 
@@ -180,6 +183,13 @@ def _solve_linear(
             work.gram,
         )
         np.dot(p.lift.T, work.reduced_right[:r], right)
+    for j in range(right.shape[0]):
+        if work.blocked[j]:  # as an empty column
+            right[j] = 0.0
+            x[j] = 0.0
+            for i in range(right.shape[0]):
+                work.gram[i, j] = 0.0
+                work.gram[j, i] = 0.0
     return solve_scaled(
         work.gram, right, x, p.tolerance, 6 * right.shape[0], work.active_set
     )

@@ -56,6 +56,7 @@ def kernel_options(comparison: Comparison, *, solve: bool) -> Options:
         float(comparison.noise_floor),
         max(comparison.min_samples, 1),
         solve,
+        float(comparison.min_width),
     )
 
 

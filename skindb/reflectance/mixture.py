@@ -44,6 +44,7 @@ from skindb.reflectance.tables import (
     Table,
     TableGrid,
     directional_albedo,
+    half_widths,
     kernel_tables,
     pad_to_lanes,
 )
@@ -168,6 +169,12 @@ class Mixture:
     def normal_albedo(self) -> Array:
         """Fraction (r,) of light along the normal that each table reflects."""
         return np.asarray(directional_albedo(self.table, 1.0)[0])
+
+    @cached_property
+    def half_width(self) -> Float64:
+        """Half width (m,) of the lobe of each BRDF that is mixed, see `half_widths`."""
+        table = self.table if self.dictionary is None else self.dictionary.table
+        return half_widths(table)
 
     @property
     def provenance(self) -> dict[str, Any]:
@@ -319,7 +326,7 @@ class Mixture:
 
     @property
     def _tables(self) -> Tables:
-        return Tables(self.filled, self.matrix)
+        return Tables(self.filled, self.matrix, self.half_width)
 
     def _scaled(self, parameters: Array | None) -> Array | None:
         """Weights of the scaled tables."""

@@ -15,6 +15,8 @@ from skindb.reflectance.tables import Table
 from skindb.schema.notes import Omission
 from skindb.types import Array
 
+# `Comparison.min_width` of fits: the peaks of narrower lobes would be extrapolated
+MIN_LOBE_WIDTH = 2.0 / 3.0
 MAX_TABLES = 8  # that the viewer shows: two textures of four channels each
 
 
@@ -63,6 +65,9 @@ class Comparison(NamedTuple):
     eta: float = 1.3  # refractive index of the diffuse term
     noise_floor: float = 1.0  # sr^-1; samples below it are compared linearly
     min_samples: int = 1  # per surfel
+    # half width of the narrowest lobe of a surfel over the smallest angle between its
+    # normal and a half vector; 0: lobes of any width
+    min_width: float = 0.0
 
 
 class SurfaceFit(NamedTuple):

@@ -14,10 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from skindb.jit import LANES
 from skindb.optics.angles import directions, half_difference
-from skindb.types import Array
+from skindb.types import Array, Float64
 
 Table = NDArray[np.float32]
 ANGLES = ("theta_h", "theta_d", "phi_d")
+
+
+WIDTH_DIFFERENCE = np.radians(20)  # theta_d at which widths of lobes are measured
 
 
 @dataclass(frozen=True)
@@ -160,6 +163,24 @@ def directional_albedo(table: NDArray[Any], cos_o: ArrayLike, *, n: int = 96) ->
             np.einsum("ij,ijm->m", weight, lookup(table, *half_difference(wi, wo)))
         )
     return np.stack(rows)
+
+
+def half_widths(table: NDArray[Any]) -> Float64:
+    """Half width at half maximum (m,) [rad], as an angle theta_h between the normal and
+    the half vector, of BRDFs (nh, nd, np, m) at theta_d of about 20 degrees; pi / 2 for
+    BRDFs that nowhere fall below half of their peak.
+    """
+    grid = TableGrid(*table.shape[:3])
+    d = int(np.abs(grid.theta_d - WIDTH_DIFFERENCE).argmin())
+    lobe = table[:, d].mean(axis=1, dtype=np.float64)
+    below = lobe < lobe[:1] / 2
+    first = below.argmax(axis=0)
+    theta = grid.theta_h
+    columns = np.arange(lobe.shape[1])
+    high, low = lobe[first - 1, columns], lobe[first, columns]
+    between = (high - lobe[0] / 2) / np.where(high > low, high - low, 1.0)
+    width = theta[first - 1] + between * (theta[first] - theta[first - 1])
+    return np.where(below.any(axis=0), width, np.pi / 2)
 
 
 def pad_to_lanes(table: Table) -> Table:

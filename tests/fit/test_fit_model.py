@@ -20,6 +20,7 @@ from skindb.fit import (
     fit_model,
     fit_surface,
     held_out_error,
+    refine_jointly,
     refit,
     second_pass,
     summarise_translucency,
@@ -201,6 +202,7 @@ def test_fit_model__passes_are_their_separate_methods(
     work = fitted_part(whole, held_out)
     alone = estimate_normals(work)
     alone = alone.merge(estimate_diffuse_reflectance(work.merge(alone)))
+    alone = alone.assign(refine_jointly(work.merge(alone)))
     alone = alone.merge(
         fit_surface(
             work.merge(alone),

@@ -10,6 +10,7 @@ from skindb.reflectance.tables import (
     DEFAULT_GRID,
     TableGrid,
     directional_albedo,
+    half_widths,
     lookup,
     tabulate,
 )
@@ -78,3 +79,21 @@ def test_directional_albedo__equals_a_plain_integral_over_directions():
     )
     # the horizon cuts cells
     np.testing.assert_allclose(directional_albedo(table, 0.8), want, rtol=5e-3)
+
+
+def test_half_widths__of_ggx_are_those_of_the_formula():
+    """The distribution falls to a half where cos^2 = (1 - sqrt 2 a^2) / (1 - a^2)."""
+    roughness = np.array([0.1, 0.2, 0.4])
+    square = roughness**2
+
+    def evaluate(wi, wo):
+        half = wi + wo
+        cosine = half[..., 2] / np.maximum(np.linalg.norm(half, axis=-1), 1e-9)
+        q = cosine[..., None] ** 2 * (square - 1) + 1
+        return np.concatenate([square / q**2, np.ones_like(q[..., :1])], axis=-1)
+
+    width = half_widths(tabulate(evaluate))
+    expected = np.arccos(np.sqrt((1 - np.sqrt(2) * square) / (1 - square)))
+    # linear between nodes that are 1 to 2 degrees apart
+    np.testing.assert_allclose(width[:3], expected, atol=np.radians(0.15))
+    assert width[3] == np.pi / 2

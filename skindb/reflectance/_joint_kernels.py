@@ -1,0 +1,677 @@
+"""Compiled joint fit of the normal, R_d and GGX lobes of graded widths to the samples of a
+surfel; `skindb.reflectance.joint` describes the model.
+
+Each step needs only the weighted Gram matrix of one table per surfel, whose columns are
+the diffuse shape, its derivatives by the normal, those of the surface, the lobes, and the
+samples of the three channels.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from skindb.jit import LANES, fast_kernel, kernel, unpack
+from skindb.numerics._nnls_kernels import (
+    ActiveSetMemory,
+    active_set_memory,
+    factor,
+    solve,
+    solve_scaled,
+)
+from skindb.reflectance._lumitexel_kernels import (
+    FITTED,
+    MIN_COSINE_SURFACE,
+    OUTLIER_SPREAD,
+    Lumitexel,
+    Options,
+    RootMemory,
+    block_memory,
+    choose,
+    root_memory,
+    sample_status,
+    slopes,
+    split_diffuse,
+    surface_factor,
+    weigh,
+    weigh_outliers,
+    write_cosines,
+    write_directions,
+    write_gloss,
+    write_samples,
+)
+from skindb.reflectance._mixture_kernels import gram
+from skindb.reflectance._shade_kernels import transmittance
+from skindb.reflectance.model import Block
+from skindb.types import IntVector, Matrix, Matrix32, Vector, Vector32
+
+LOBES = LANES  # one vector register
+# columns of the table: diffuse shape, its derivatives, those of the surface, lobes, samples
+DIFFUSE = 0
+TURNED = 1
+SURFACE = 3
+LOBE = 5
+SAMPLE = LOBE + LOBES
+WIDTH = SAMPLE + 3
+PARAMETERS = 3 + LOBES  # R_d and the strengths of the lobes
+UNKNOWNS = PARAMETERS + 2  # and two angles of the normal
+# Gauss-Newton steps in the normal: a second one changed normals by 0.002 degrees and
+# predictions of photographed faces by 0.02 % (three faces, one capture)
+STEPS = 1
+# of the step, because errors of the given normal are partly independent of those of the
+# joint fit: on six captures with known truth, medians are 0.5 to 0.8 degrees (imperfect
+# capture 1.7), best or within 0.07 of the better one of both
+STEP_FRACTION = 0.7
+MAX_STEP = 0.15  # rad
+DIFFERENCE = 1e-3  # rad, for derivatives by the normal
+KKT_TOLERANCE = 1e-8
+# half width at half maximum of a lobe, as an angle of the half vector, over its roughness
+HALF_WIDTH = math.sqrt(math.sqrt(2.0) - 1.0)
+ONE, HALF_PER_PI = (np.float32(c) for c in (1.0, 0.5 / math.pi))
+
+
+class Lobes(NamedTuple):
+    """The lobes, from wide to narrow, and the scan's normals."""
+
+    square: Vector32  # (LOBES,) squared roughness
+    refractive_index: float  # of their Fresnel factor
+    scan: Matrix  # (n, 3) unit normals of the scan
+    scan_error: float  # rad, standard error of these about each axis
+
+
+class JointFit(NamedTuple):
+    """Results for n surfels; NaN where nothing was fitted. Angles are in rad."""
+
+    normal: Matrix  # (n, 3)
+    normal_error: Vector  # (n,) RMS angle for independent samples
+    normal_shared: Vector  # (n,) and for errors by device
+    diffuse: Matrix  # (n, 3)
+    diffuse_error: Matrix  # (n, 3)
+    diffuse_shared: Matrix  # (n, 3)
+    strength: Matrix  # (n, LOBES)
+    half_angle: Vector  # (n,) smallest of the samples
+    kkt: Vector  # (n,) of the last non-negative problem
+
+
+class JointMemory(NamedTuple):
+    """Memory for one surfel; each thread needs its own."""
+
+    table: Matrix32  # (rows, WIDTH)
+    fresnel: Vector32  # (rows,) of the lobes
+    nearness: Vector32  # (rows,) 1 / |w_i + w_o|^2
+    weight: Vector32  # (rows,)
+    none: Vector32  # (rows,) zeros
+    root: RootMemory
+    lit: Matrix32  # (lights, LOBES) factors of Smith's masking
+    seen: Matrix32  # (cameras, LOBES)
+    moments: Matrix  # (WIDTH, WIDTH) Gram matrix of the table
+    rest: Vector  # (WIDTH,)
+    block: Matrix32  # (LANES + 1, LANES) sums in vector registers
+    active_set: ActiveSetMemory
+    x: Vector  # (PARAMETERS,) R_d and strengths
+    target: Vector  # (PARAMETERS,) right side
+    gram: Matrix  # (PARAMETERS, PARAMETERS)
+    cross: Matrix  # (PARAMETERS, 2) of the parameters and the normal
+    turn: Matrix  # (2, 2) of the normal
+    pull: Vector  # (2,) right side of the normal
+    step: Vector  # (2,) rad
+    normal: Vector  # (3,)
+    turned: Vector  # (3,)
+    axes: Matrix  # (2, 3) tangents
+    scaled: Matrix  # (UNKNOWNS, UNKNOWNS)
+    cholesky: Matrix  # (UNKNOWNS, UNKNOWNS)
+    inverse: Matrix  # (UNKNOWNS, UNKNOWNS)
+    score: Vector  # (UNKNOWNS,)
+    by_light: Matrix  # (lights, UNKNOWNS) sums of the scores
+    by_camera: Matrix  # (cameras, UNKNOWNS)
+    independent: Matrix  # (UNKNOWNS, UNKNOWNS) sums of the products of scores
+    shared: Matrix  # (UNKNOWNS, UNKNOWNS)
+
+
+@kernel
+def joint_memory(lights: int, cameras: int) -> JointMemory:
+    """Memory for surfels under these lights and cameras."""
+    size = lights * cameras
+    v = np.zeros((4, size), np.float32)
+    square = np.empty((5, UNKNOWNS, UNKNOWNS))
+    return JointMemory(
+        np.zeros((size, WIDTH), np.float32),
+        v[0],
+        v[1],
+        v[2],
+        v[3],
+        root_memory(size),
+        np.empty((lights, LOBES), np.float32),
+        np.empty((cameras, LOBES), np.float32),
+        np.empty((WIDTH, WIDTH)),
+        np.empty(WIDTH),
+        np.empty((LANES + 1, LANES), np.float32),
+        active_set_memory(PARAMETERS),
+        np.empty(PARAMETERS),
+        np.empty(PARAMETERS),
+        np.empty((PARAMETERS, PARAMETERS)),
+        np.empty((PARAMETERS, 2)),
+        np.empty((2, 2)),
+        np.empty(2),
+        np.empty(2),
+        np.empty(3),
+        np.empty(3),
+        np.empty((2, 3)),
+        square[0],
+        square[1],
+        square[2],
+        np.empty(UNKNOWNS),
+        np.empty((lights, UNKNOWNS)),
+        np.empty((cameras, UNKNOWNS)),
+        square[3],
+        square[4],
+    )
+
+
+@kernel
+def _write_angles(count: int, index: float, b: Lumitexel, m: JointMemory) -> None:
+    """Write what the lobes need of the directions, whatever the normal."""
+    for r in range(count):
+        i = b.pairs[r, 0]
+        o = b.pairs[r, 1]
+        both = 0.0
+        for k in range(3):
+            both += b.to_light[i, k] * b.to_camera[o, k]
+        apart = math.sqrt(max((1.0 + both) / 2.0, 0.0))
+        reflected = 1.0 - transmittance(min(apart, 1.0), index)
+        m.fresnel[r] = reflected * surface_factor(r, b)
+        m.nearness[r] = 1.0 / max(2.0 + 2.0 * both, 1e-9)
+
+
+@kernel
+def _face(
+    n: Vector, eta: float, square: Vector32, b: Lumitexel, m: JointMemory
+) -> None:
+    """Write cosines and the factors of the diffuse shape and of masking for a normal."""
+    write_cosines(n, eta, 0.0, b)
+    for i in range(b.lit.shape[0]):
+        for j in range(LOBES):
+            m.lit[i, j] = math.sqrt(square[j] + (1.0 - square[j]) * b.lit[i] ** 2)
+    for o in range(b.seen.shape[0]):
+        for j in range(LOBES):
+            m.seen[o, j] = math.sqrt(square[j] + (1.0 - square[j]) * b.seen[o] ** 2)
+
+
+@fast_kernel
+def _write_columns(
+    count: int, square: Vector32, b: Lumitexel, m: JointMemory
+) -> np.float32:
+    """Write the diffuse shape and the lobes, D F G / (4 cos_o) of GGX with the
+    height-correlated masking of Smith (Heitz 2014, eq. 71 and 99); returns the largest
+    squared cosine of a half angle.
+    """
+    nearest = np.float32(0)
+    for r in range(count):
+        i = b.pairs[r, 0]
+        o = b.pairs[r, 1]
+        light = np.float32(b.lit[i])
+        camera = np.float32(b.seen[o])
+        m.table[r, DIFFUSE] = b.enters[i] * b.leaves[o]
+        half = min((light + camera) * (light + camera) * m.nearness[r], ONE)
+        above = light > 0 and camera > 0
+        nearest = max(nearest, half if above else np.float32(0))
+        strength = m.fresnel[r] * light * HALF_PER_PI if above else np.float32(0)
+        camera = camera if above else ONE
+        light = light if above else ONE
+        for j in range(LOBES):
+            q = half * (square[j] - ONE) + ONE
+            shadow = camera * m.lit[i, j] + light * m.seen[o, j]
+            m.table[r, LOBE + j] = strength * square[j] / (q * q * shadow)
+    return nearest
+
+
+@fast_kernel
+def _write_turned(
+    count: int, k: int, square: Vector32, b: Lumitexel, m: JointMemory
+) -> None:
+    """Write the derivatives of the diffuse shape and of the surface by angle k of the
+    normal, which `_face` has turned by DIFFERENCE.
+    """
+    per_angle = np.float32(1.0 / DIFFERENCE)
+    for r in range(count):
+        i = b.pairs[r, 0]
+        o = b.pairs[r, 1]
+        light = np.float32(b.lit[i])
+        camera = np.float32(b.seen[o])
+        half = min((light + camera) * (light + camera) * m.nearness[r], ONE)
+        above = light > 0 and camera > 0
+        strength = m.fresnel[r] * light * HALF_PER_PI if above else np.float32(0)
+        shape = np.float32(b.enters[i] * b.leaves[o])
+        camera = camera if above else ONE
+        light = light if above else ONE
+        change = np.float32(0)
+        for j in range(LOBES):
+            q = half * (square[j] - ONE) + ONE
+            shadow = camera * m.lit[i, j] + light * m.seen[o, j]
+            lobe = strength * square[j] / (q * q * shadow)
+            change += np.float32(m.x[3 + j]) * (lobe - m.table[r, LOBE + j])
+        m.table[r, TURNED + k] = (shape - m.table[r, DIFFUSE]) * per_angle
+        m.table[r, SURFACE + k] = change * per_angle
+
+
+@kernel
+def _write_axes(n: Vector, axes: Matrix) -> None:
+    """Write two unit tangents (Duff et al. 2017)."""
+    sign = 1.0 if n[2] >= 0.0 else -1.0
+    a = -1.0 / (sign + n[2])
+    both = n[0] * n[1] * a
+    axes[0, 0] = 1.0 + sign * n[0] * n[0] * a
+    axes[0, 1] = sign * both
+    axes[0, 2] = -sign * n[0]
+    axes[1, 0] = both
+    axes[1, 1] = sign + n[1] * n[1] * a
+    axes[1, 2] = -n[1]
+
+
+@kernel
+def _turn(first: float, second: float, m: JointMemory) -> None:
+    """Write to `m.turned` the normal, turned by small angles."""
+    square = 0.0
+    for k in range(3):
+        m.turned[k] = m.normal[k] + first * m.axes[0, k] + second * m.axes[1, k]
+        square += m.turned[k] ** 2
+    for k in range(3):
+        m.turned[k] /= math.sqrt(square)
+
+
+@kernel
+def _write_derivatives(
+    count: int, eta: float, square: Vector32, b: Lumitexel, m: JointMemory
+) -> None:
+    """Write the derivatives by the normal for the parameters `m.x`."""
+    _write_axes(m.normal, m.axes)
+    for k in range(2):
+        _turn(DIFFERENCE * (1 - k), DIFFERENCE * k, m)
+        _face(m.turned, eta, square, b, m)
+        _write_turned(count, k, square, b, m)
+    _face(m.normal, eta, square, b, m)
+
+
+@kernel
+def _write_weights(
+    s: int, count: int, block: Block, o: Options, b: Lumitexel, m: JointMemory
+) -> None:
+    """Weights of the samples by the slope of the cube root at the prediction, by their
+    noise, and by their residuals.
+    """
+    split_diffuse(m.x, count, b)
+    weigh(s, count, block.noise, o, b)
+    mean = np.float32((m.x[0] + m.x[1] + m.x[2]) / 3.0)
+    for r in range(count):
+        surface = np.float32(0)
+        for j in range(LOBES):
+            surface += np.float32(m.x[3 + j]) * m.table[r, LOBE + j]
+        b.surface[r] = surface
+    weigh_outliers(count, o, b, m.root)
+    for r in range(count):
+        b.surface[r] += mean * m.table[r, DIFFUSE]
+    slopes(b.surface[:count], np.float32(o.floor), m.root, m.weight)
+    for r in range(count):
+        m.weight[r] *= b.weight[r]
+
+
+@kernel
+def _write_equations(lobes: int, m: JointMemory) -> None:
+    """Write the normal equations of R_d, of the first lobes and of the normal, from the
+    Gram matrix of the table.
+    """
+    M = m.moments
+    total = m.x[0] + m.x[1] + m.x[2]
+    squares = m.x[0] ** 2 + m.x[1] ** 2 + m.x[2] ** 2
+    m.gram[:] = 0.0
+    m.target[:] = 0.0
+    m.cross[:] = 0.0
+    m.pull[:] = 0.0
+    for c in range(3):
+        m.gram[c, c] = M[DIFFUSE, DIFFUSE]
+        m.target[c] = M[DIFFUSE, SAMPLE + c]
+        for j in range(lobes):
+            m.gram[c, 3 + j] = M[DIFFUSE, LOBE + j]
+            m.gram[3 + j, c] = M[DIFFUSE, LOBE + j]
+            m.target[3 + j] += M[LOBE + j, SAMPLE + c]
+        for k in range(2):
+            m.cross[c, k] = m.x[c] * M[DIFFUSE, TURNED + k] + M[DIFFUSE, SURFACE + k]
+            m.pull[k] += m.x[c] * M[TURNED + k, SAMPLE + c] + M[SURFACE + k, SAMPLE + c]
+    for i in range(lobes):
+        for j in range(lobes):
+            m.gram[3 + i, 3 + j] = 3.0 * M[LOBE + i, LOBE + j]
+        for k in range(2):
+            shape = total * M[LOBE + i, TURNED + k]
+            m.cross[3 + i, k] = shape + 3.0 * M[LOBE + i, SURFACE + k]
+    for k in range(2):
+        for q in range(2):
+            mixed = M[TURNED + k, SURFACE + q] + M[SURFACE + k, TURNED + q]
+            m.turn[k, q] = squares * M[TURNED + k, TURNED + q] + total * mixed
+            m.turn[k, q] += 3.0 * M[SURFACE + k, SURFACE + q]
+
+
+@kernel
+def _variance(count: int, m: JointMemory) -> float:
+    """Weighted mean square of the residuals at `m.x`."""
+    M = m.moments
+    total = 0.0
+    for c in range(3):
+        d = m.x[c]
+        total += M[SAMPLE + c, SAMPLE + c] + d * d * M[DIFFUSE, DIFFUSE]
+        total -= 2.0 * d * M[DIFFUSE, SAMPLE + c]
+        for i in range(LOBES):
+            x = m.x[3 + i]
+            total += 2.0 * x * (d * M[DIFFUSE, LOBE + i] - M[LOBE + i, SAMPLE + c])
+            for j in range(LOBES):
+                total += x * m.x[3 + j] * M[LOBE + i, LOBE + j]
+    return max(total, 0.0) / max(3.0 * count - UNKNOWNS, 1.0)
+
+
+@kernel
+def _add_scan(s: int, variance: float, lobes: Lobes, m: JointMemory) -> None:
+    """Add the prior that the normal is that of the scan."""
+    precision = variance / (lobes.scan_error * lobes.scan_error)
+    for k in range(2):
+        m.turn[k, k] += precision
+        for q in range(3):
+            m.pull[k] += precision * m.axes[k, q] * lobes.scan[s, q]
+
+
+@kernel
+def _eliminate_normal(m: JointMemory) -> bool:
+    """Write the equations of the other parameters for the best normal (Schur complement);
+    `m.turn` becomes its inverse. Returns whether the normal is determined.
+    """
+    a = m.turn[0, 0]
+    d = m.turn[1, 1]
+    both = m.turn[0, 1]
+    det = a * d - both * both
+    if not det > 1e-9 * a * d:
+        return False
+    m.turn[0, 0] = d / det
+    m.turn[1, 1] = a / det
+    m.turn[0, 1] = -both / det
+    m.turn[1, 0] = -both / det
+    for i in range(PARAMETERS):
+        for k in range(2):
+            lean = m.cross[i, 0] * m.turn[0, k] + m.cross[i, 1] * m.turn[1, k]
+            m.target[i] -= lean * m.pull[k]
+            for j in range(PARAMETERS):
+                m.gram[i, j] -= lean * m.cross[j, k]
+        m.gram[i, i] = max(m.gram[i, i], 0.0)
+    return True
+
+
+@kernel
+def _solve_parameters(m: JointMemory) -> float:
+    """Write `m.x`; returns the KKT residual."""
+    limit = 6 * PARAMETERS
+    kkt, _, _, _ = solve_scaled(
+        m.gram, m.target, m.x, KKT_TOLERANCE, limit, m.active_set
+    )
+    return kkt
+
+
+@kernel
+def _turn_normal(
+    s: int, count: int, lobes: Lobes, eta: float, b: Lumitexel, m: JointMemory
+) -> None:
+    """A Gauss-Newton step of the normal together with the other parameters."""
+    _add_scan(s, _variance(count, m), lobes, m)
+    if not _eliminate_normal(m):
+        return
+    _solve_parameters(m)
+    for k in range(2):
+        m.step[k] = 0.0
+        for q in range(2):
+            rest = m.pull[q]
+            for i in range(PARAMETERS):
+                rest -= m.cross[i, q] * m.x[i]
+            m.step[k] += m.turn[k, q] * rest
+    size = math.sqrt(m.step[0] ** 2 + m.step[1] ** 2)
+    shrink = min(STEP_FRACTION, MAX_STEP / max(size, 1e-12))
+    _turn(shrink * m.step[0], shrink * m.step[1], m)
+    for k in range(3):
+        m.normal[k] = m.turned[k]
+    _face(m.normal, eta, lobes.square, b, m)
+    _write_columns(count, lobes.square, b, m)
+
+
+@kernel
+def _invert(k: int, active: IntVector, m: JointMemory) -> bool:
+    """Write the inverse of the equations of the k active parameters and the normal;
+    returns whether they are independent.
+    """
+    size = k + 2
+    G = m.scaled
+    for i in range(k):
+        for j in range(k):
+            G[i, j] = m.gram[active[i], active[j]]
+        for q in range(2):
+            G[i, k + q] = m.cross[active[i], q]
+            G[k + q, i] = m.cross[active[i], q]
+    for p in range(2):
+        for q in range(2):
+            G[k + p, k + q] = m.turn[p, q]
+    length = np.zeros(size)
+    order = np.arange(size)
+    for i in range(size):
+        length[i] = 1.0 / math.sqrt(G[i, i]) if G[i, i] > 0.0 else 0.0
+    for i in range(size):
+        for j in range(size):
+            G[i, j] *= length[i] * length[j]
+    if factor(G, order, 0, size, m.cholesky) >= 0:
+        return False
+    unit = np.zeros(size)
+    z = np.empty(size)
+    for p in range(size):
+        unit[:] = 0.0
+        unit[p] = 1.0
+        solve(m.cholesky, unit, order, size, z)
+        for c in range(size):
+            m.inverse[p, c] = z[c] * length[p] * length[c]
+    return True
+
+
+@kernel
+def _write_scores(
+    count: int, k: int, active: IntVector, b: Lumitexel, m: JointMemory
+) -> None:
+    """Write the products of the gradients of single samples and channels, and their sums by
+    device.
+    """
+    size = k + 2
+    m.independent[:] = 0.0
+    m.by_light[:] = 0.0
+    m.by_camera[:] = 0.0
+    error = np.empty(3)
+    for r in range(count):
+        surface = 0.0
+        for j in range(LOBES):
+            surface += m.x[3 + j] * m.table[r, LOBE + j]
+        total = 0.0
+        shaded = 0.0
+        for c in range(3):
+            rest = m.table[r, SAMPLE + c] - surface - m.x[c] * m.table[r, DIFFUSE]
+            error[c] = m.weight[r] * rest
+            total += error[c]
+            shaded += error[c] * m.x[c]
+        for c in range(3):
+            m.score[c] = m.table[r, DIFFUSE] * error[c]
+        for i in range(3, k):
+            m.score[i] = m.table[r, LOBE + active[i] - 3] * total
+        for q in range(2):
+            turned = m.table[r, TURNED + q] * shaded
+            m.score[k + q] = turned + m.table[r, SURFACE + q] * total
+        for p in range(size):
+            m.by_light[b.pairs[r, 0], p] += m.score[p]
+            m.by_camera[b.pairs[r, 1], p] += m.score[p]
+            for q in range(p + 1):
+                m.independent[p, q] += m.score[p] * m.score[q]
+
+
+@kernel
+def _add_products(sums: Matrix, size: int, out: Matrix) -> None:
+    """Add the products of the rows of devices with samples, scaled for their number."""
+    used = 0
+    for i in range(sums.shape[0]):
+        used += 1 if sums[i, 0] != 0.0 else 0
+    scale = used / max(used - 1.0, 1.0)
+    for i in range(sums.shape[0]):
+        if sums[i, 0] != 0.0:
+            for p in range(size):
+                for q in range(p + 1):
+                    out[p, q] += scale * sums[i, p] * sums[i, q]
+
+
+@kernel
+def _variance_of(p: int, size: int, scores: Matrix, inverse: Matrix) -> float:
+    """Variance of unknown p by a sandwich of the lower half of the products of scores."""
+    total = 0.0
+    for i in range(size):
+        total += inverse[p, i] ** 2 * scores[i, i]
+        for j in range(i):
+            total += 2.0 * inverse[p, i] * scores[i, j] * inverse[p, j]
+    return max(total, 0.0)
+
+
+@kernel
+def _write_errors(
+    s: int, count: int, b: Lumitexel, m: JointMemory, out: JointFit
+) -> None:
+    """Standard errors of R_d and of the normal together with the positive strengths: for
+    independent samples (White 1980), and for errors by light and by camera (Cameron,
+    Gelbach and Miller 2011).
+    """
+    active = np.arange(PARAMETERS)
+    k = 3
+    for j in range(3, PARAMETERS):
+        if m.x[j] > 0.0:
+            active[k] = j
+            k += 1
+    if not _invert(k, active, m):
+        return
+    size = k + 2
+    _write_scores(count, k, active, b, m)
+    for p in range(size):
+        for q in range(p + 1):
+            m.shared[p, q] = -m.independent[p, q]
+    _add_products(m.by_light, size, m.shared)
+    _add_products(m.by_camera, size, m.shared)
+    few = OUTLIER_SPREAD * count / max(count - size, 1.0)
+    normal = 0.0
+    normal_shared = 0.0
+    for p in range(size):
+        alone = few * _variance_of(p, size, m.independent, m.inverse)
+        together = max(
+            OUTLIER_SPREAD * _variance_of(p, size, m.shared, m.inverse), alone
+        )
+        if p < 3:
+            out.diffuse_error[s, p] = math.sqrt(alone)
+            out.diffuse_shared[s, p] = math.sqrt(together)
+        elif p >= k:
+            normal += alone
+            normal_shared += together
+    out.normal_error[s] = math.sqrt(normal)
+    out.normal_shared[s] = math.sqrt(normal_shared)
+
+
+@kernel
+def _sum_table(count: int, m: JointMemory) -> None:
+    """Write the Gram matrix of the table."""
+    gram(m.table, count, m.weight, m.none, m.moments, m.rest, m.block)
+
+
+@kernel
+def _start(
+    s: int,
+    count: int,
+    block: Block,
+    lobes: Lobes,
+    eta: float,
+    b: Lumitexel,
+    m: JointMemory,
+) -> np.float32:
+    """Write the table and the parameters for the given normal and R_d; returns the largest
+    squared cosine of a half angle.
+    """
+    m.x[:] = 0.0
+    for k in range(3):
+        m.normal[k] = block.normal[s, k]
+        m.x[k] = block.diffuse[s, k]
+    for r in range(count):
+        for k in range(TURNED, LOBE):
+            m.table[r, k] = 0.0
+        for c in range(3):
+            m.table[r, SAMPLE + c] = b.sample[c, r]
+    _write_angles(count, lobes.refractive_index, b, m)
+    _face(m.normal, eta, lobes.square, b, m)
+    return _write_columns(count, lobes.square, b, m)
+
+
+@kernel
+def _fit(
+    s: int,
+    count: int,
+    block: Block,
+    lobes: Lobes,
+    o: Options,
+    b: Lumitexel,
+    m: JointMemory,
+    out: JointFit,
+) -> None:
+    """Fit the chosen samples of surfel s."""
+    nearest = _start(s, count, block, lobes, o.eta, b, m)
+    half_angle = math.acos(math.sqrt(min(nearest, ONE)))
+    wide = 1
+    while (
+        wide < LOBES
+        and HALF_WIDTH * math.sqrt(lobes.square[wide]) >= o.min_width * half_angle
+    ):
+        wide += 1
+    _write_weights(s, count, block, o, b, m)
+    _sum_table(count, m)
+    _write_equations(wide, m)
+    _solve_parameters(m)
+    for _ in range(STEPS):
+        _write_weights(s, count, block, o, b, m)
+        _write_derivatives(count, o.eta, lobes.square, b, m)
+        _sum_table(count, m)
+        _write_equations(wide, m)
+        _turn_normal(s, count, lobes, o.eta, b, m)
+    _write_weights(s, count, block, o, b, m)
+    _sum_table(count, m)
+    _write_equations(wide, m)
+    out.kkt[s] = _solve_parameters(m)
+    _write_equations(wide, m)
+    _add_scan(s, _variance(count, m), lobes, m)
+    _write_errors(s, count, b, m, out)
+    out.half_angle[s] = half_angle
+    for k in range(3):
+        out.normal[s, k] = m.normal[k]
+        out.diffuse[s, k] = m.x[k]
+    for j in range(LOBES):
+        out.strength[s, j] = m.x[3 + j]
+
+
+@kernel
+def fit_jointly(block: Block, lobes: Lobes, o: Options, out: JointFit) -> None:
+    """Fit every surfel of a block that has a normal, R_d and enough samples."""
+    b = block_memory(block, 0)
+    m = joint_memory(block.light.shape[0], block.camera.shape[0])
+    for s in range(block.position.shape[0]):
+        n = block.normal[s]
+        known = np.isfinite(n).all() and np.isfinite(block.diffuse[s]).all()
+        if not known or not np.isfinite(block.position[s]).all():
+            continue
+        unpack(block.sample[s], b.values)
+        if sample_status(b.values) != FITTED:
+            continue
+        write_directions(block.position[s], block.light, block.camera, b)
+        write_gloss(block.polarisation, o.eta, b)
+        write_cosines(n, o.eta, MIN_COSINE_SURFACE, b)
+        if choose(b) < o.min_samples:
+            continue
+        _fit(s, write_samples(b), block, lobes, o, b, m, out)

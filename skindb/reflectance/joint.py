@@ -1,0 +1,71 @@
+"""Joint fit of the normal, R_d and the surface to the samples of surfels.
+
+A sample is cos(theta_i) (F_t F_t R_d / pi + sum_j x_j b_j) with R_d >= 0 of three channels
+and strengths x_j >= 0 of GGX lobes b_j of graded widths. Given the normal this is a
+non-negative least-squares problem; the normal is refined with all other parameters by a
+Gauss-Newton step. Weights are those of a comparison of cube roots, less for noisy samples
+and for outliers (Tukey's function). A surfel has no lobes narrower than 2/3 of the
+smallest angle at which it was seen from its normal to a half vector: their peaks would be
+extrapolated.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from skindb.reflectance._joint_kernels import LOBES, JointFit, Lobes, fit_jointly
+from skindb.reflectance.block import kernel_block, kernel_options
+from skindb.reflectance.model import Block, Comparison
+from skindb.types import Array
+
+__all__ = ["ROUGHNESS", "JointFit", "refine_block"]
+
+# from nearly even to the narrowest that lights of a dome resolve
+ROUGHNESS = np.geomspace(0.9, 0.04, LOBES)
+# of skin, 1.40 to 1.45 measured (Ding et al. 2006); the strengths adapt to another one
+SURFACE_INDEX = 1.4
+
+
+def refine_block(
+    block: Block, comparison: Comparison, *, scan_normal: Array, scan_error: float
+) -> JointFit:
+    """Normal, R_d and strengths of the lobes of n surfels, from the given ones.
+
+    Parameters
+    ----------
+    block
+        Samples, with estimates of the normal and of R_d.
+    comparison
+        In mode "perceptual".
+    scan_normal
+        (n, 3) unit normals of the scan.
+    scan_error
+        Standard error of the scan's normals about each axis [rad], of a prior.
+
+    Returns
+    -------
+    JointFit
+        NaN for surfels without estimates or with too few samples, and errors are NaN where
+        the parameters cannot be distinguished.
+    """
+    n = len(block.position)
+    out = JointFit(
+        normal=np.full((n, 3), np.nan),
+        normal_error=np.full(n, np.nan),
+        normal_shared=np.full(n, np.nan),
+        diffuse=np.full((n, 3), np.nan),
+        diffuse_error=np.full((n, 3), np.nan),
+        diffuse_shared=np.full((n, 3), np.nan),
+        strength=np.full((n, LOBES), np.nan),
+        half_angle=np.full(n, np.nan),
+        kkt=np.full(n, np.nan),
+    )
+    lobes = Lobes(
+        np.asarray(ROUGHNESS**2, np.float32),
+        SURFACE_INDEX,
+        np.ascontiguousarray(scan_normal, np.float64),
+        float(scan_error),
+    )
+    options = kernel_options(comparison, solve=True)
+    fit_jointly(kernel_block(block), lobes, options, out)
+    return out
