@@ -35,10 +35,9 @@ MAX_DEVIATIONS = 1.0
 # Error of R_d relative to it, by lobes of other shapes: R_d was 1.7 to 2.6 % too low in
 # proportion in four captures without other errors.
 PROPORTIONAL_ERROR = 0.02
-# Of R_d that was estimated together with nearly even lobes, by light that these confuse
-# with it. In five captures R_d was 0.003 too high to 0.010 too low, whatever the lobes
-# lacked (0.002 to 0.021): to subtract this from R_d doubled its error.
-JOINT_ERROR = 0.01
+# Fraction of what the highlights lack that R_d contains if it was estimated together with
+# nearly even lobes, which take the rest: 0.4 to 0.9 in blue in four captures.
+JOINT_FRACTION = 0.5
 # error of what highlights do not show without a prior of the total: highlights of bare
 # skin show the half of it, more or less
 UNKNOWN_ERROR = SURFACE_ENERGY["normal"][0] / 2
@@ -100,8 +99,8 @@ def without_even_reflection(
         From `crossed_gloss`; if it is given, R_d contains only this fraction of the even
         reflection, and nothing is subtracted.
     jointly
-        Whether R_d was estimated together with lobes that are nearly even: nothing is
-        subtracted, as these already took it from R_d.
+        Whether R_d was estimated together with lobes that are nearly even: half is
+        subtracted, as these took the rest from R_d.
 
     Returns
     -------
@@ -112,8 +111,7 @@ def without_even_reflection(
         error. It is negative if the fitted lobes reflect too much, which R_d then
         lacks. It is subtracted from R_d, and `dipole_s` follows. Without a prior, or if
         the highlights contradict it, nothing is subtracted. Its error and 0.02 R_d are
-        added to the total error of R_d, in quadrature. If R_d was estimated jointly,
-        the error is that of the prior and of the joint fit together.
+        added to the total error of R_d, in quadrature.
     summary
         Attribute `surface_energy` of the model: prior, what the highlights show, and
         whether they contradict it, which they do above one standard deviation.
@@ -133,11 +131,11 @@ def without_even_reflection(
     elif prior is not None:
         contradicted = seen > prior.mean + MAX_DEVIATIONS * prior.error
         summary |= prior._asdict() | {"contradicted": contradicted}
-        if jointly and not contradicted:
-            error = prior.error * JOINT_ERROR / np.hypot(prior.error, JOINT_ERROR)
-        elif not contradicted:
+        if not contradicted:
             largest = float(np.quantile(diffuse[good, 2], DARKEST))
-            even, error = min(prior.mean - seen, largest), prior.error
+            fraction = JOINT_FRACTION if jointly else 1.0
+            even = min(fraction * (prior.mean - seen), largest)
+            error = prior.error
     lower = np.clip(diffuse - even, SMALLEST_R_D, LARGEST_R_D)
     parts = (
         fitted[variables.DIFFUSE_REFLECTANCE_TOTAL_ERROR].values,
