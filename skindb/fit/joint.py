@@ -31,6 +31,8 @@ from skindb.types import Array
 TOTAL_SHARED = 2.0
 TOTAL_NOISE = 6.0
 TOTAL_ANGLE = 0.5
+# of a solution that has converged: above the rounding of its equations, 1e-7
+MAX_KKT = 1e-6
 REFINED = (
     "shading_normal",
     "normal_error",
@@ -59,9 +61,9 @@ def refine_jointly(
     -------
     Dataset
         The variables of both functions, refined (see `skindb.reflectance.joint`); as
-        given for surfels with fewer than ten samples, or whose parameters cannot be
-        distinguished. R_d of captures with polarisers, measured behind crossed ones,
-        is kept.
+        given for surfels with fewer than ten samples, whose parameters cannot be
+        distinguished, or whose fit has not converged. R_d of captures with polarisers,
+        measured behind crossed ones, is kept.
     """
     check(lumitexels, (*GEOMETRY, "surfel_normal", *REFINED), where="lumitexels")
     comparison = Comparison(
@@ -89,13 +91,15 @@ def refine_jointly(
             np.hypot(refined.diffuse_shared, MODEL_ERROR_ALBEDO),
             dipole_s(reflectance, eta=eta)[0],
         )
-        known = np.isfinite(refined.normal_error)[:, None]
-        kept = REFINED[3:] if POLARISATION[0] in arrays else ()
+        converged = np.isfinite(refined.normal_error) & (refined.kkt < MAX_KKT)
+        unchanged = REFINED[3:] if POLARISATION[0] in arrays else ()
         return tuple(
             arrays[name]
-            if name in kept
+            if name in unchanged
             else np.where(
-                known if column.ndim > 1 else known[:, 0], column, arrays[name]
+                converged[:, None] if column.ndim > 1 else converged,
+                column,
+                arrays[name],
             )
             for name, column in zip(REFINED, columns, strict=True)
         )

@@ -78,6 +78,36 @@ def solve(L: Matrix, b: Vector, active: IntVector, k: int, z: Vector) -> None:
 
 
 @kernel
+def invert(
+    G: Matrix, active: IntVector, k: int, scaled: Matrix, L: Matrix, out: Matrix
+) -> bool:
+    """Write to out (k, k) the inverse of G on its k active columns, scaled to unit length
+    in between; returns whether they are independent.
+    """
+    m = scaled.shape[0]
+    length = np.zeros(m)
+    unit = np.zeros(m)
+    z = np.empty(m)
+    for p in range(k):
+        i = active[p]
+        length[i] = 1.0 / math.sqrt(G[i, i]) if G[i, i] > 0.0 else 0.0
+    for p in range(k):
+        for c in range(k):
+            i = active[p]
+            j = active[c]
+            scaled[i, j] = G[i, j] * length[i] * length[j]
+    if factor(scaled, active, 0, k, L) >= 0:
+        return False
+    for p in range(k):
+        unit[:] = 0.0
+        unit[active[p]] = 1.0
+        solve(L, unit, active, k, z)
+        for c in range(k):
+            out[p, c] = z[c] * length[active[p]] * length[active[c]]
+    return True
+
+
+@kernel
 def _gradient(G: Matrix, b: Vector, x: Vector, w: Vector) -> None:
     m = b.shape[0]
     for j in range(m):  # a copy of arrays, `w[:] = b`, would take seconds to compile

@@ -134,8 +134,8 @@ def fit_block(block: Block, tables: Tables, options: Options, out: SurfaceFit) -
         if options.mode == PAPER:
             _cube_roots(count, b)
         x = out.parameters[s]
-        _block_narrow(tables.half_width, count, options.min_width, b, work)
         if options.solve:
+            _block_narrow(tables.half_width, count, options.min_width, b, work)
             out.kkt[s], out.iterations[s], converged, out.condition[s] = _fit_rows(
                 count, lift, options, x, b, work
             )
@@ -179,13 +179,10 @@ def _write_covariance(
         b.scattered[:, :count],
         drift,
         out.parameters[s],
+        OUTLIER_SPREAD if options.mode == PERCEPTUAL else 1.0,
         out.covariance[s],
         work,
     )
-    if options.mode == PERCEPTUAL:
-        for j in range(out.covariance.shape[1]):
-            for k in range(out.covariance.shape[1]):
-                out.covariance[s, j, k] *= OUTLIER_SPREAD
 
 
 @kernel
@@ -275,8 +272,8 @@ def judge_block(
             continue
         split_diffuse(block.diffuse[s], count, b)
         weigh(s, count, block.noise, options, b)
-        _block_narrow(tables.half_width, count, options.min_width, b, work)
         if options.solve:
+            _block_narrow(tables.half_width, count, options.min_width, b, work)
             _fit_rows(count, lift, options, x, b, work)
             if options.mode == PERCEPTUAL:
                 predict(b.rows, count, x, b.surface, work.single)

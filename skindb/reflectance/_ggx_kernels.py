@@ -28,6 +28,7 @@ from skindb.reflectance._lumitexel_kernels import (
     add_surface,
     block_memory,
     choose_kind,
+    cosine_between,
     fitted_status,
     outliers,
     prepare,
@@ -114,9 +115,7 @@ def _write_angles(r: int, index: float, b: Lumitexel, lobe: Lobe) -> None:
     """Write what the lobe needs of the directions of a sample; 0 below the horizon."""
     i = b.pairs[r, 0]
     o = b.pairs[r, 1]
-    both = 0.0
-    for k in range(3):
-        both += b.to_light[i, k] * b.to_camera[o, k]
+    both = cosine_between(i, o, b)
     light = b.lit[i]
     camera = b.seen[o]
     above = light > 0.0 and camera > 0.0

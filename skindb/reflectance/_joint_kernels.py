@@ -17,8 +17,7 @@ from skindb.jit import LANES, fast_kernel, kernel, unpack
 from skindb.numerics._nnls_kernels import (
     ActiveSetMemory,
     active_set_memory,
-    factor,
-    solve,
+    invert,
     solve_scaled,
 )
 from skindb.reflectance._lumitexel_kernels import (
@@ -30,9 +29,11 @@ from skindb.reflectance._lumitexel_kernels import (
     RootMemory,
     block_memory,
     choose,
+    cosine_between,
     root_memory,
     sample_status,
     slopes,
+    smallest_half_angle,
     split_diffuse,
     surface_factor,
     weigh,
@@ -91,7 +92,6 @@ class JointFit(NamedTuple):
     diffuse_error: Matrix  # (n, 3)
     diffuse_shared: Matrix  # (n, 3)
     strength: Matrix  # (n, LOBES)
-    half_angle: Vector  # (n,) smallest of the samples
     kkt: Vector  # (n,) of the last non-negative problem
 
 
@@ -120,7 +120,7 @@ class JointMemory(NamedTuple):
     normal: Vector  # (3,)
     turned: Vector  # (3,)
     axes: Matrix  # (2, 3) tangents
-    scaled: Matrix  # (UNKNOWNS, UNKNOWNS)
+    equations: Matrix  # (UNKNOWNS, UNKNOWNS) of the active parameters and the normal
     cholesky: Matrix  # (UNKNOWNS, UNKNOWNS)
     inverse: Matrix  # (UNKNOWNS, UNKNOWNS)
     score: Vector  # (UNKNOWNS,)
@@ -176,9 +176,7 @@ def _write_angles(count: int, index: float, b: Lumitexel, m: JointMemory) -> Non
     for r in range(count):
         i = b.pairs[r, 0]
         o = b.pairs[r, 1]
-        both = 0.0
-        for k in range(3):
-            both += b.to_light[i, k] * b.to_camera[o, k]
+        both = cosine_between(i, o, b)
         apart = math.sqrt(max((1.0 + both) / 2.0, 0.0))
         reflected = 1.0 - transmittance(min(apart, 1.0), index)
         m.fresnel[r] = reflected * surface_factor(r, b)
@@ -200,14 +198,10 @@ def _face(
 
 
 @fast_kernel
-def _write_columns(
-    count: int, square: Vector32, b: Lumitexel, m: JointMemory
-) -> np.float32:
+def _write_columns(count: int, square: Vector32, b: Lumitexel, m: JointMemory) -> None:
     """Write the diffuse shape and the lobes, D F G / (4 cos_o) of GGX with the
-    height-correlated masking of Smith (Heitz 2014, eq. 71 and 99); returns the largest
-    squared cosine of a half angle.
+    height-correlated masking of Smith (Heitz 2014, eq. 71 and 99).
     """
-    nearest = np.float32(0)
     for r in range(count):
         i = b.pairs[r, 0]
         o = b.pairs[r, 1]
@@ -216,7 +210,6 @@ def _write_columns(
         m.table[r, DIFFUSE] = b.enters[i] * b.leaves[o]
         half = min((light + camera) * (light + camera) * m.nearness[r], ONE)
         above = light > 0 and camera > 0
-        nearest = max(nearest, half if above else np.float32(0))
         strength = m.fresnel[r] * light * HALF_PER_PI if above else np.float32(0)
         camera = camera if above else ONE
         light = light if above else ONE
@@ -224,7 +217,6 @@ def _write_columns(
             q = half * (square[j] - ONE) + ONE
             shadow = camera * m.lit[i, j] + light * m.seen[o, j]
             m.table[r, LOBE + j] = strength * square[j] / (q * q * shadow)
-    return nearest
 
 
 @fast_kernel
@@ -445,7 +437,7 @@ def _invert(k: int, active: IntVector, m: JointMemory) -> bool:
     returns whether they are independent.
     """
     size = k + 2
-    G = m.scaled
+    G = m.equations
     for i in range(k):
         for j in range(k):
             G[i, j] = m.gram[active[i], active[j]]
@@ -455,24 +447,7 @@ def _invert(k: int, active: IntVector, m: JointMemory) -> bool:
     for p in range(2):
         for q in range(2):
             G[k + p, k + q] = m.turn[p, q]
-    length = np.zeros(size)
-    order = np.arange(size)
-    for i in range(size):
-        length[i] = 1.0 / math.sqrt(G[i, i]) if G[i, i] > 0.0 else 0.0
-    for i in range(size):
-        for j in range(size):
-            G[i, j] *= length[i] * length[j]
-    if factor(G, order, 0, size, m.cholesky) >= 0:
-        return False
-    unit = np.zeros(size)
-    z = np.empty(size)
-    for p in range(size):
-        unit[:] = 0.0
-        unit[p] = 1.0
-        solve(m.cholesky, unit, order, size, z)
-        for c in range(size):
-            m.inverse[p, c] = z[c] * length[p] * length[c]
-    return True
+    return invert(G, np.arange(size), size, m.shared, m.cholesky, m.inverse)
 
 
 @kernel
@@ -593,10 +568,8 @@ def _start(
     eta: float,
     b: Lumitexel,
     m: JointMemory,
-) -> np.float32:
-    """Write the table and the parameters for the given normal and R_d; returns the largest
-    squared cosine of a half angle.
-    """
+) -> None:
+    """Write the table and the parameters for the given normal and R_d."""
     m.x[:] = 0.0
     for k in range(3):
         m.normal[k] = block.normal[s, k]
@@ -608,7 +581,7 @@ def _start(
             m.table[r, SAMPLE + c] = b.sample[c, r]
     _write_angles(count, lobes.refractive_index, b, m)
     _face(m.normal, eta, lobes.square, b, m)
-    return _write_columns(count, lobes.square, b, m)
+    _write_columns(count, lobes.square, b, m)
 
 
 @kernel
@@ -623,13 +596,10 @@ def _fit(
     out: JointFit,
 ) -> None:
     """Fit the chosen samples of surfel s."""
-    nearest = _start(s, count, block, lobes, o.eta, b, m)
-    half_angle = math.acos(math.sqrt(min(nearest, ONE)))
+    _start(s, count, block, lobes, o.eta, b, m)
+    narrowest = o.min_width * smallest_half_angle(count, b)
     wide = 1
-    while (
-        wide < LOBES
-        and HALF_WIDTH * math.sqrt(lobes.square[wide]) >= o.min_width * half_angle
-    ):
+    while wide < LOBES and HALF_WIDTH * math.sqrt(lobes.square[wide]) >= narrowest:
         wide += 1
     _write_weights(s, count, block, o, b, m)
     _sum_table(count, m)
@@ -648,7 +618,6 @@ def _fit(
     _write_equations(wide, m)
     _add_scan(s, _variance(count, m), lobes, m)
     _write_errors(s, count, b, m, out)
-    out.half_angle[s] = half_angle
     for k in range(3):
         out.normal[s, k] = m.normal[k]
         out.diffuse[s, k] = m.x[k]

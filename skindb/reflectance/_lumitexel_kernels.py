@@ -241,15 +241,22 @@ def _towards(target: Matrix, p: Vector, out: Matrix) -> None:
 
 
 @kernel
+def cosine_between(light: int, camera: int, b: Lumitexel) -> float:
+    """Cosine of the angle between the directions to a light and to a camera."""
+    total = 0.0
+    for k in range(3):
+        total += b.to_light[light, k] * b.to_camera[camera, k]
+    return total
+
+
+@kernel
 def write_gloss(polarisation: Matrix, eta: float, b: Lumitexel) -> None:
     """Write the factor of the surface part of every light and camera: polarisers of the
     same handedness are crossed, as the reflection reverses it.
     """
     for i in range(polarisation.shape[0]):
         for o in range(polarisation.shape[1]):
-            both = 0.0
-            for k in range(3):
-                both += b.to_light[i, k] * b.to_camera[o, k]
+            both = cosine_between(i, o, b)
             apart = math.sqrt(min(max((1.0 + both) / 2.0, 0.0), 1.0))
             crossed = polarisation[i, o] * circular_reversal(apart, eta)
             b.gloss[i, o] = max(1.0 - crossed, MIN_GLOSS)
@@ -376,9 +383,7 @@ def smallest_half_angle(count: int, b: Lumitexel) -> float:
     for r in range(count):
         i = b.pairs[r, 0]
         o = b.pairs[r, 1]
-        both = 0.0
-        for k in range(3):
-            both += b.to_light[i, k] * b.to_camera[o, k]
+        both = cosine_between(i, o, b)
         along = (b.lit[i] + b.seen[o]) ** 2
         nearest = max(nearest, along / max(2.0 + 2.0 * both, 1e-12))
     return math.acos(math.sqrt(min(nearest, 1.0)))

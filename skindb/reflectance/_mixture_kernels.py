@@ -13,8 +13,7 @@ from skindb.jit import LANES, dots, fast_kernel, kernel, products
 from skindb.numerics._nnls_kernels import (
     ActiveSetMemory,
     active_set_memory,
-    factor,
-    solve,
+    invert,
     solve_scaled,
 )
 from skindb.reflectance._lumitexel_kernels import (
@@ -569,34 +568,6 @@ def _scores(
 
 
 @kernel
-def _inverse_gram(active: IntVector, k: int, work: FitMemory, inverse: Matrix) -> bool:
-    """Write the inverse (k, k) of the Gram matrix of the active columns; returns whether
-    they are independent.
-    """
-    G = work.reduced_gram
-    H = work.gram
-    L = work.active_set.factor
-    m = H.shape[0]
-    length = np.ones(m)
-    unit = np.zeros(m)
-    z = np.empty(m)
-    for j in range(m):
-        length[j] = 1.0 / math.sqrt(G[j, j]) if G[j, j] > 0.0 else 0.0
-    for i in range(m):
-        for j in range(m):
-            H[i, j] = G[i, j] * length[i] * length[j]
-    if factor(H, active, 0, k, L) >= 0:
-        return False
-    for p in range(k):
-        unit[:] = 0.0
-        unit[active[p]] = 1.0
-        solve(L, unit, active, k, z)
-        for c in range(k):
-            inverse[p, c] = z[c] * length[active[p]] * length[active[c]]
-    return True
-
-
-@kernel
 def weight_covariance(
     rows: Matrix32,
     y: Vector32,
@@ -606,13 +577,15 @@ def weight_covariance(
     scattered: Matrix32,
     drift: Vector,
     x: Vector,
+    spread: float,
     out: Matrix,
     work: FitMemory,
 ) -> None:
     """Covariance (m, m) of the positive weights, directly after `fit_one` with a square
     lift; NaN for the others.
 
-    `weight` (n,) are the weights of the rows in that fit.
+    `weight` (n,) are the weights of the rows in that fit, and `spread` is the factor by
+    which they make the first part too small.
 
     The covariance has two parts: a sandwich estimate from the residuals of whole rows
     (White 1980), which is valid for noise of any size that the channels may share; and
@@ -635,7 +608,7 @@ def weight_covariance(
     _scores(y, weight, perceptual, floor, scattered, drift, work)
     gram(rows, n, work.slope, work.aim, G, b, work.block)
     inverse = np.zeros((m, m))
-    if not _inverse_gram(active, k, work, inverse):
+    if not invert(G, active, k, work.gram, work.active_set.factor, inverse):
         return  # collinear columns: all their mixtures fit equally well
     shift = np.zeros(m)
     for p in range(k):
@@ -648,7 +621,9 @@ def weight_covariance(
             for i in range(k):
                 for j in range(k):
                     total += inverse[p, i] * G[active[i], active[j]] * inverse[j, c]
-            out[active[p], active[c]] = total * n / (n - k) + shift[p] * shift[c]
+            out[active[p], active[c]] = (
+                spread * total * n / (n - k) + shift[p] * shift[c]
+            )
     for p in range(k):
         # collinear up to the rounding of the Gram matrix
         if not out[active[p], active[p]] > 0.0:

@@ -57,7 +57,6 @@ def refine_block(
         diffuse_error=np.full((n, 3), np.nan),
         diffuse_shared=np.full((n, 3), np.nan),
         strength=np.full((n, LOBES), np.nan),
-        half_angle=np.full(n, np.nan),
         kkt=np.full(n, np.nan),
     )
     lobes = Lobes(

@@ -18,8 +18,6 @@ from skindb.types import Array, Float64
 
 Table = NDArray[np.float32]
 ANGLES = ("theta_h", "theta_d", "phi_d")
-
-
 WIDTH_DIFFERENCE = np.radians(20)  # theta_d at which widths of lobes are measured
 
 
@@ -168,7 +166,7 @@ def directional_albedo(table: NDArray[Any], cos_o: ArrayLike, *, n: int = 96) ->
 def half_widths(table: NDArray[Any]) -> Float64:
     """Half width at half maximum (m,) [rad], as an angle theta_h between the normal and
     the half vector, of BRDFs (nh, nd, np, m) at theta_d of about 20 degrees; pi / 2 for
-    BRDFs that nowhere fall below half of their peak.
+    BRDFs that nowhere fall below half of their peak, and 0 for black ones.
     """
     grid = TableGrid(*table.shape[:3])
     d = int(np.abs(grid.theta_d - WIDTH_DIFFERENCE).argmin())
@@ -180,7 +178,8 @@ def half_widths(table: NDArray[Any]) -> Float64:
     high, low = lobe[first - 1, columns], lobe[first, columns]
     between = (high - lobe[0] / 2) / np.where(high > low, high - low, 1.0)
     width = theta[first - 1] + between * (theta[first] - theta[first - 1])
-    return np.where(below.any(axis=0), width, np.pi / 2)
+    width = np.where(below.any(axis=0), width, np.pi / 2)
+    return np.where(lobe[0] > 0, width, 0.0)
 
 
 def pad_to_lanes(table: Table) -> Table:

@@ -267,6 +267,7 @@ def test_weight_covariance__is_the_sandwich_in_plain_numpy(perceptual):
         scattered,
         drift,
         x,
+        1.0,
         covariance,
         work,
     )
@@ -305,7 +306,16 @@ def test_weight_covariance__collinear_columns_have_none():
     _mixture_kernels.fit_one(problem, np.zeros(2), work)
     nothing = _as_fits_give(np.zeros((3, 50))), np.zeros(3)
     _mixture_kernels.weight_covariance(
-        filled, 0 * ones, ones, False, 1.0, *nothing, np.full(2, 0.5), covariance, work
+        filled,
+        0 * ones,
+        ones,
+        False,
+        1.0,
+        *nothing,
+        np.full(2, 0.5),
+        1.0,
+        covariance,
+        work,
     )
     assert np.isnan(covariance).all()
 
