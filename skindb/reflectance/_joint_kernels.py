@@ -493,7 +493,9 @@ def _add_products(sums: Matrix, size: int, out: Matrix) -> None:
     used = 0
     for i in range(sums.shape[0]):
         used += 1 if sums[i, 0] != 0.0 else 0
-    scale = used / max(used - 1.0, 1.0)
+    if used < 2:  # the sum over one device is the gradient, not an error
+        return
+    scale = used / (used - 1.0)
     for i in range(sums.shape[0]):
         if sums[i, 0] != 0.0:
             for p in range(size):

@@ -184,3 +184,16 @@ def test_refine_jointly__states_a_total_error_above_that_of_noise():
     assert (refined["normal_total_error"] > refined["normal_error"]).all()
     angle = _angle(refined["shading_normal"].values, skin.normal)
     assert (angle < 1.73 * refined["normal_total_error"].values).mean() > 0.8
+
+
+def test_refine_block__one_camera_alone_shares_no_error(dome):
+    """The sum over all samples is the gradient, which a damped step leaves."""
+    rng = np.random.default_rng(7)
+    normal = _normals(30, 0.1, rng)
+    light, camera = dome
+    one = (light, camera[:1])
+    start = _unit(normal + np.radians(3) * rng.normal(size=normal.shape))
+    refined = _refined(_samples(normal, *one), start, one)
+    ratio = refined.normal_shared / refined.normal_error
+    # each light has one sample: the same errors but for the number of lights
+    assert np.nanmax(ratio) < 1.1
