@@ -195,5 +195,5 @@ def test_refine_block__one_camera_alone_shares_no_error(dome):
     start = _unit(normal + np.radians(3) * rng.normal(size=normal.shape))
     refined = _refined(_samples(normal, *one), start, one)
     ratio = refined.normal_shared / refined.normal_error
-    # each light has one sample: the same errors but for the number of lights
+    # each light has one sample: the same errors, up to the number of lights
     assert np.nanmax(ratio) < 1.1
