@@ -11,7 +11,7 @@ from scipy.optimize import least_squares, nnls
 from benchmarks.peers import WIDTHS
 from skindb.optics.angles import directions
 from skindb.optics.fresnel import fresnel_reflectance
-from skindb.reflectance.dictionary import abc_parameters, evaluate_abc
+from skindb.reflectance.dictionary import abc_parameters, evaluate_embedded
 
 Array = NDArray[np.float64]
 
@@ -37,7 +37,10 @@ def brdf_rows(path: Path) -> list[list[str]]:
     above = np.minimum(wi[..., 2], wo[..., 2]) > MIN_COSINE
     measured = {name: values[names.index(name)][above] for name in abc_parameters()}
     fits = {
-        "mixture of the other 58 + Lambert": _others(wi[above], wo[above]),
+        "mixture of the other 58 + Lambert": _others(wi[above], wo[above], lobes=False),
+        "skindb: the other 58, eight lobes + Lambert": _others(
+            wi[above], wo[above], lobes=True
+        ),
         "GGX + Lambert": _one_ggx(theta_h[above], theta_d[above], wi[above], wo[above]),
         f"mixture of {GGX_WIDTHS.size * len(INDICES)} GGX lobes + Lambert": _ggx_mixture(
             theta_h[above], theta_d[above], wi[above], wo[above]
@@ -76,12 +79,12 @@ def _perceptual_nnls(columns: Array, value: Array) -> Array:
     return np.asarray(columns @ weights)
 
 
-def _others(wi: Array, wo: Array):
-    lobes = evaluate_abc(np.array([*abc_parameters().values()], np.float64), wi, wo)
+def _others(wi: Array, wo: Array, *, lobes: bool):
     order = list(abc_parameters())
+    columns = evaluate_embedded(wi, wo)[:, : None if lobes else len(order)]
 
     def estimate(material: str, value: Array) -> Array:
-        without = np.delete(lobes, order.index(material), axis=1)
+        without = np.delete(columns, order.index(material), axis=1)
         return _perceptual_nnls(np.column_stack([without, np.ones(len(value))]), value)
 
     return estimate

@@ -245,7 +245,9 @@ class FitParameters(Limited):
         "Space of the least squares: cube-root space, linear, or that of the paper.",
     )
     rank: int = option(
-        16, "Rank of the reduced dictionary of a mixture (59 is exact).", minimum=1
+        16,
+        "Rank of the reduced dictionary of a mixture, beside the GGX lobes (59 is exact).",
+        minimum=1,
     )
     eta: float = option(1.3, "Refractive index of skin.", minimum=1.0, maximum=2.0)
     surface_energy: float | Literal["condition", "unknown"] = option(

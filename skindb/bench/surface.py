@@ -39,7 +39,7 @@ MIN_COSINE_SAMPLES = 0.1  # to light and camera, as in `skindb.reflectance.reduc
 LINEAR = "RMS error of the surface's reflectance at the samples over its RMS"
 ROOTS = "the same error in cube-root space"
 TRUTH = (
-    "planted mixtures of the 59 BRDFs under 150 lights and 16 cameras; samples are "
+    "planted mixtures of the embedded BRDFs under 150 lights and 16 cameras; samples are "
     "half floats with 5 % noise"
 )
 SCIPY = "SciPy nnls, precomputed rows, three channels"
@@ -59,7 +59,7 @@ class Strip:
     offsets: NDArray[
         np.int64
     ]  # (n + 1,) index of the first row of each surfel, and the total
-    rows: Array  # (total, 59) float64
+    rows: Array  # (total, m) float64
     target: Array  # (total, 3) samples minus the diffuse term
     true: Array  # (total,) surface term without noise
     directions: tuple[Array, Array, Array]  # wi, wo, normal of each row
@@ -252,7 +252,7 @@ def _both_spaces(
 
 
 def surface_curves(quick: bool) -> list[Curve]:
-    """All 59 BRDFs by mode and rank."""
+    """All embedded BRDFs by mode and rank."""
     dictionary, samples, few = _problem(quick)
     results = []
     for rows, table in (
@@ -267,7 +267,7 @@ def surface_curves(quick: bool) -> list[Curve]:
     for mode in ("linear", "perceptual", "paper"):
         table = np.cbrt(dictionary.table) if mode == "paper" else dictionary.table
         for rank in (16, 59) if quick else (8, 12, 16, 24, 59):
-            model = Mixture(*reduce_dictionary(table, rank))
+            model = Mixture(*reduce_dictionary(table, rank, exact=dictionary.exact))
             seconds, fit = _fit(samples, model, mode)
             details = {
                 "kkt": float(fit.kkt.max()),
@@ -353,11 +353,11 @@ def nmf_curves(quick: bool) -> list[Curve]:
 
 
 def _planted_weights(n: int) -> tuple[Array, Array]:
-    """Weights (n, 59), mixtures of sparse rows H with scatter like that of similar
+    """Weights (n, m), mixtures of sparse rows H with scatter like that of similar
     BRDFs, and H.
     """
     rng = np.random.default_rng(0)
-    shape = (COMPONENTS, 59)
+    shape = (COMPONENTS, len(embedded_dictionary().names))
     H = np.where(rng.random(shape) < 0.2, rng.uniform(0.2, 1, shape), 0)
     H[:, :COMPONENTS] += np.eye(COMPONENTS)
     X = rng.gamma(0.7, 1.0, (n, COMPONENTS)) @ H

@@ -72,8 +72,8 @@ def fit_model(
     parameters
         Default `FitParameters()`.
     dictionary
-        BRDFs for point lights that the surface is a mixture of; default the embedded
-        59, analytic fits to measured BRDFs.
+        BRDFs for point lights that the surface is a mixture of; default
+        `embedded_dictionary()`.
     progress
         Called with the stage, the number of finished steps and the total number of steps.
 

@@ -49,7 +49,7 @@ def plan_fit(
     parameters
         Parameters of the fit; default `FitParameters()`.
     dictionary
-        BRDFs for point lights; default the embedded 59.
+        BRDFs for point lights; default `embedded_dictionary()`.
 
     Returns
     -------
@@ -67,7 +67,7 @@ def plan_fit(
     -----
     Surfels with fewer samples than a fit needs are included: they get a normal and a
     status that states the reason, and cost less than the others. BRDFs that have no
-    weight anywhere, 28 of the 59 in one take, are known only after the fit: the
+    weight anywhere, 28 of 59 in one take, are known only after the fit: the
     factorisation without them takes 0.04 s less and has another start. Equal channels
     are not detected, as all three use the same system of equations.
     """

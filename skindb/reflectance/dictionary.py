@@ -1,5 +1,5 @@
-"""The dictionary of measured BRDFs whose mixtures describe a surface: 59 embedded
-materials or those of a file.
+"""The dictionary of BRDFs whose mixtures describe a surface: the 59 embedded materials and
+eight GGX lobes of graded widths, or those of a file.
 
 See `skindb.reflectance.brdf_files` for files.
 """
@@ -21,6 +21,7 @@ from skindb.files import package_json
 from skindb.optics.angles import directions, half_difference
 from skindb.optics.fresnel import fresnel_reflectance
 from skindb.reflectance import _row_kernels
+from skindb.reflectance.lobes import GRADED_NAMES, evaluate_graded
 from skindb.reflectance.tables import (
     DEFAULT_GRID,
     Table,
@@ -36,10 +37,11 @@ Rule = tuple[int, int]  # rings and points per ring of a quadrature over a disc
 # away from the mirror direction and near it; see `convolve_disc`
 FAR_RULE = (4, 12)
 NEAR_RULE = (12, 36)
-EMBEDDED = "analytic fits to measured BRDFs (ABC parameters of Loew et al. 2012)"
+EMBEDDED = "analytic fits to measured BRDFs (ABC parameters of Loew et al. 2012), and GGX lobes"
 # modules that determine the tables; a change of their source invalidates the cache
 SOURCES = (
     "skindb.reflectance.dictionary",
+    "skindb.reflectance.lobes",
     "skindb.reflectance.reduction",
     "skindb.reflectance.tables",
     "skindb.reflectance._row_kernels",
@@ -85,6 +87,7 @@ class Dictionary:
     origins: tuple[Origin, ...] = ()  # one per material read from files
     # `digest` of the tables for point lights that were averaged over the disc
     point_digest: str = ""
+    exact: int = 0  # number of materials, the last ones, that no reduction changes
 
     @cached_property
     def digest(self) -> str:
@@ -175,24 +178,28 @@ def evaluate_abc(parameters: Array, wi: Array, wo: Array) -> Array:
     return out
 
 
+def evaluate_embedded(wi: Array, wo: Array) -> Array:
+    """BRDFs (..., 67) of `embedded_dictionary` [sr^-1]."""
+    rows = np.array(list(abc_parameters().values()))
+    lobes = evaluate_graded(wi, wo)
+    return np.concatenate([evaluate_abc(rows, wi, wo), lobes], axis=-1)
+
+
 @cache
 def embedded_dictionary() -> Dictionary:
-    """The 59 materials of `abc_parameters` on the default grid."""
-    rows = np.array(list(abc_parameters().values()))
-
-    def make() -> dict[str, Table]:
-        return {
-            "table": tabulate(lambda wi, wo: evaluate_abc(rows, wi, wo), DEFAULT_GRID)
-        }
-
-    table = cached_arrays(
+    """The 59 materials of `abc_parameters` and the lobes of `GRADED_ROUGHNESS` on the
+    default grid.
+    """
+    cached = cached_arrays(
         "embedded-dictionary",
         (DEFAULT_GRID, abc_parameters()),
         sources=SOURCES,
-        make=make,
-    )["table"]
+        make=lambda: {"table": tabulate(evaluate_embedded, DEFAULT_GRID)},
+    )
+    table = cached["table"]
     table.setflags(write=False)
-    return Dictionary(tuple(abc_parameters()), table, DEFAULT_GRID, EMBEDDED)
+    names = (*abc_parameters(), *GRADED_NAMES)
+    return Dictionary(names, table, DEFAULT_GRID, EMBEDDED, exact=len(GRADED_NAMES))
 
 
 def sample_pairs(count: int = 20_000, lowest: float = 0.1) -> tuple[Array, Array]:
@@ -437,11 +444,8 @@ def dictionary_quality(
         figures["hole_fraction"] = np.array(
             [origin.hole_fraction for origin in dictionary.origins]
         )
-    elif (
-        dictionary.names == tuple(abc_parameters())
-        and not dictionary.disc_angular_radius
-    ):
-        exact = evaluate_abc(np.array(list(abc_parameters().values())), wi, wo)
+    elif dictionary.source == EMBEDDED and not dictionary.disc_angular_radius:
+        exact = evaluate_embedded(wi, wo)
         values = lookup(dictionary.table, *half_difference(wi, wo))
         figures |= {
             "interpolation_error": weighted_error(values, exact, wi, wo),

@@ -19,7 +19,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
-from skindb.optics.fresnel import fresnel_reflectance
 from skindb.reflectance import _ggx_kernels
 from skindb.reflectance._ggx_kernels import (
     MAX_ROUGHNESS,
@@ -35,6 +34,7 @@ from skindb.reflectance.block import (
     kernel_options,
     shade_diffuse,
 )
+from skindb.reflectance.lobes import evaluate_lobe
 from skindb.reflectance.model import (
     MAX_TABLES,
     Block,
@@ -58,31 +58,12 @@ from skindb.schema import check, dataset, variables
 from skindb.schema.notes import Omission
 from skindb.types import Array
 
-MIN_COSINE_LOBE = (
-    1e-3  # below it values continue, as tables have nodes below the horizon
-)
 ALBEDO_NODES = 24  # roughnesses at which the reflectance of a lobe is integrated
 # tables that stand for all lobes of a take, between which weights are interpolated; with a
 # ratio of 1.3 between neighbours, values differ by up to 2 % of the peak
 TABLES = MAX_TABLES
 # of the roughnesses of a take, between which tables are placed
 TABLE_QUANTILES = (0.01, 0.99)
-
-
-def evaluate_lobe(wi: Array, wo: Array, alpha: Array | float, index: float) -> Array:
-    """BRDF (...) [sr^-1] of lobes of strength 1, for unit directions (..., 3) in the local
-    frame; cosines are clamped to `MIN_COSINE_LOBE`.
-    """
-    light = np.maximum(wi[..., 2], MIN_COSINE_LOBE)
-    camera = np.maximum(wo[..., 2], MIN_COSINE_LOBE)
-    half = wi + wo
-    half = half / np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-12)
-    square = np.asarray(alpha) ** 2
-    spread = square / (np.pi * (half[..., 2] ** 2 * (square - 1) + 1) ** 2)
-    shadow = camera * np.sqrt(square + (1 - square) * light**2)
-    shadow = shadow + light * np.sqrt(square + (1 - square) * camera**2)
-    cos_d = np.clip((half * wi).sum(axis=-1), 0.0, 1.0)
-    return np.asarray(fresnel_reflectance(cos_d, index) * spread / (2 * shadow))
 
 
 @lru_cache(maxsize=4)

@@ -15,15 +15,11 @@ import numpy as np
 
 from skindb.reflectance._joint_kernels import LOBES, JointFit, Lobes, fit_jointly
 from skindb.reflectance.block import kernel_block, kernel_options
+from skindb.reflectance.lobes import GRADED_ROUGHNESS, SURFACE_INDEX
 from skindb.reflectance.model import Block, Comparison
 from skindb.types import Array
 
-__all__ = ["ROUGHNESS", "JointFit", "refine_block"]
-
-# from nearly even to the narrowest that lights of a dome resolve
-ROUGHNESS = np.geomspace(0.9, 0.04, LOBES)
-# of skin, 1.40 to 1.45 measured (Ding et al. 2006); the strengths adapt to another one
-SURFACE_INDEX = 1.4
+__all__ = ["JointFit", "refine_block"]
 
 
 def refine_block(
@@ -60,7 +56,7 @@ def refine_block(
         kkt=np.full(n, np.nan),
     )
     lobes = Lobes(
-        np.asarray(ROUGHNESS**2, np.float32),
+        np.asarray(GRADED_ROUGHNESS**2, np.float32),
         SURFACE_INDEX,
         np.ascontiguousarray(scan_normal, np.float64),
         float(scan_error),

@@ -185,7 +185,9 @@ class Mixture:
     def settings(self) -> dict[str, Any]:
         """Rank of the dictionary, or number of components."""
         count = self.table.shape[-1]
-        return {"k": count} if self.dictionary is None else {"rank": count}
+        if self.dictionary is None:
+            return {"k": count}
+        return {"rank": count - self.dictionary.exact}
 
     @property
     def omissions(self) -> tuple[Omission, ...]:
@@ -198,14 +200,15 @@ class Mixture:
         """
         if self.dictionary is None or self.lift is None:
             return ()
-        rank, count = self.lift.shape
-        if rank >= count:
+        space, count = self.lift.shape
+        if space >= count:
             return ()
+        rank = space - self.dictionary.exact
         bound = rank_truncation(self.dictionary, rank, self.roots)
         subject = "cube roots of mixtures" if self.roots else "mixtures"
         omission = Omission(
             "dimensions of the dictionary",
-            count - rank,
+            count - space,
             count,
             f"rank {rank}; at a single pair of directions up to {bound.worst:.3g} "
             "times the value",

@@ -146,7 +146,7 @@ class FitRequest(NamedTuple):
     mode: str  # see `Comparison`
     rank: int  # of the reduced dictionary
     k: int  # components that the model is reduced to after the first pass
-    dictionary: Dictionary | None = None  # for point lights; default the embedded 59
+    dictionary: Dictionary | None = None  # for point lights; default the embedded one
 
 
 class DirectionSampler(Protocol):

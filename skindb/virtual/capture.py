@@ -309,7 +309,8 @@ def _materials() -> tuple[Dictionary, NDArray[np.float64]]:
     table = np.ascontiguousarray(embedded.table[..., index])
     # the tables are convolved with the disc of the lights: one ray per pixel and light is enough
     disc = convolve_disc(
-        replace(embedded, names=MATERIALS, table=table), DISC_RADIUS / LIGHT_RADIUS
+        replace(embedded, names=MATERIALS, table=table, exact=0),
+        DISC_RADIUS / LIGHT_RADIUS,
     )
     return disc, directional_albedo(table, np.ones(1))[0]
 

@@ -12,8 +12,8 @@ from skindb.errors import InputError
 from skindb.fit import fit_model
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.parameters import FitParameters
-from skindb.reflectance.ggx import evaluate_lobe
 from skindb.reflectance.kinds import as_mixture, require_mixture
+from skindb.reflectance.lobes import evaluate_lobe
 from skindb.render import evaluate
 from skindb.schema import FitStatus, label
 

@@ -13,7 +13,8 @@ from skindb.fit import (
     estimate_normals,
     refine_jointly,
 )
-from skindb.reflectance.joint import ROUGHNESS, refine_block
+from skindb.reflectance.joint import refine_block
+from skindb.reflectance.lobes import GRADED_ROUGHNESS
 from skindb.reflectance.model import (
     MIN_LOBE_WIDTH,
     Block,
@@ -25,7 +26,7 @@ COMPARISON = Comparison("perceptual", ETA, 2e-3, 10, MIN_LOBE_WIDTH)
 FAR_MM = 1e6
 R_D = np.array([0.5, 0.3, 0.2])
 STRENGTH = 1.2
-LOBE = 3  # of ROUGHNESS
+LOBE = 3  # of GRADED_ROUGHNESS
 # half floats have a relative error of 5e-4
 HALF_FLOAT = 1e-3
 
@@ -50,7 +51,9 @@ def _directions(count, steepest, rng):
     return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
 
 
-def _samples(normal, light, camera, roughness=ROUGHNESS[LOBE], strength=STRENGTH):
+def _samples(
+    normal, light, camera, roughness=GRADED_ROUGHNESS[LOBE], strength=STRENGTH
+):
     """Samples (n, light, camera, 3) by the textbook form of GGX with Smith's joint masking."""
     wi = light[None, :, None]
     wo = camera[None, None]
@@ -141,7 +144,7 @@ def test_refine_block__has_no_lobe_narrower_than_what_was_seen(dome):
     refined = _refined(sample, normal, dome)
     nearest = np.arccos(np.where(np.isfinite(sample[..., 0]), cosine, 0).max((1, 2)))
     width = (
-        0.6436 * ROUGHNESS
+        0.6436 * GRADED_ROUGHNESS
     )  # tan of the half width of GGX: roughness sqrt(sqrt 2 - 1)
     narrow = width < 2 / 3 * nearest[:, None]
     assert narrow.any()

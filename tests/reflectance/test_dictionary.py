@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import mpmath
@@ -11,6 +12,7 @@ import pytest
 from scipy.integrate import quad
 
 from skindb.optics.angles import directions, half_difference
+from skindb.optics.fresnel import fresnel_reflectance
 from skindb.reflectance.dictionary import (
     Dictionary,
     abc_parameters,
@@ -19,7 +21,14 @@ from skindb.reflectance.dictionary import (
     dictionary_quality,
     embedded_dictionary,
     evaluate_abc,
+    evaluate_embedded,
     sample_pairs,
+)
+from skindb.reflectance.lobes import (
+    GRADED_NAMES,
+    GRADED_ROUGHNESS,
+    SURFACE_INDEX,
+    evaluate_lobe,
 )
 from skindb.reflectance.tables import (
     DEFAULT_GRID,
@@ -122,7 +131,16 @@ def test_embedded_dictionary__trilinear_error_is_small():
     the sharpest lobe.
     """
     wi, wo = _pairs(np.random.default_rng(0), 20000, 0.1)
-    exact = evaluate_abc(ROWS, wi, wo)
+    exact = np.concatenate(
+        [
+            evaluate_abc(ROWS, wi, wo),
+            *(
+                evaluate_lobe(wi, wo, alpha, SURFACE_INDEX)[:, None]
+                for alpha in GRADED_ROUGHNESS
+            ),
+        ],
+        axis=1,
+    )
     table = lookup(embedded_dictionary().table, *half_difference(wi, wo))
     weight = (wi[:, 2] * wo[:, 2])[:, None]
     rms = np.sqrt((weight * (table - exact) ** 2).sum(0) / (weight * exact**2).sum(0))
@@ -131,19 +149,21 @@ def test_embedded_dictionary__trilinear_error_is_small():
 
 
 @pytest.mark.parametrize("disc", [False, True])
-def test_embedded_dictionary__fifty_nine_physical_materials(disc, convolved):
+def test_embedded_dictionary__physical_materials_and_lobes(disc, convolved):
     dictionary = convolved if disc else embedded_dictionary()
-    assert (
-        len(dictionary.names)
-        == len(set(dictionary.names))
-        == dictionary.table.shape[-1]
-        == 59
-    )
+    assert dictionary.names == (*abc_parameters(), *GRADED_NAMES)
+    assert len(set(dictionary.names)) == dictionary.table.shape[-1] == 59 + 8
     assert np.isfinite(dictionary.table).all()
     assert (dictionary.table >= 0).all()
     albedo = directional_albedo(dictionary.table, [1.0, 0.7, 0.4])
     assert (albedo < 1).all()
-    assert (albedo > ROWS[:, :3].mean(1) * 0.98).all()  # at least the diffuse part
+    # at least the diffuse part
+    assert (albedo[:, :59] > ROWS[:, :3].mean(1) * 0.98).all()
+    # the lobes reflect at most what a smooth surface does, all of it if they are narrow
+    smooth = fresnel_reflectance(np.array([1.0, 0.7, 0.4]), SURFACE_INDEX)
+    np.testing.assert_allclose(
+        albedo[:2, -3:], smooth[:2, None].repeat(3, 1), rtol=0.03
+    )
 
 
 def test_embedded_dictionary__shared_and_not_writeable():
@@ -441,10 +461,9 @@ def test_dictionary_quality__a_coarse_table_is_reported():
     """With a third of the nodes along each axis, the error of interpolation is at least
     five times as large.
     """
-    rows = np.array(list(abc_parameters().values()))
     grid = TableGrid(30, 40, 8)
-    coarse = Dictionary(
-        NAMES, tabulate(lambda wi, wo: evaluate_abc(rows, wi, wo), grid), grid, "coarse"
+    coarse = replace(
+        embedded_dictionary(), table=tabulate(evaluate_embedded, grid), grid=grid
     )
     found = dictionary_quality(coarse, 0.0, pairs=PAIRS)
     fine = dictionary_quality(embedded_dictionary(), 0.0, pairs=PAIRS)

@@ -11,8 +11,9 @@ from three_surfels import polariser_factors
 
 from skindb.errors import InputError
 from skindb.parameters import FitParameters
-from skindb.reflectance.ggx import GGX, evaluate_lobe
+from skindb.reflectance.ggx import GGX
 from skindb.reflectance.kinds import SURFACES, surface_model, unfitted_model
+from skindb.reflectance.lobes import evaluate_lobe
 from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.model import (
     Block,
