@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.floating[Any]]
 Float64 = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 Index = NDArray[np.int64]  # numbers of vertices, surfels, ...
 Faces = NDArray[np.integer[Any]]  # (f, 3) vertices of triangles

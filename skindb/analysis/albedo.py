@@ -111,9 +111,7 @@ def albedo_histograms(
     for t, (sample, x) in enumerate(zip(samples, decorrelated, strict=True)):
         for r, region in enumerate(regions):
             inside = (
-                np.ones(len(x), np.bool_)
-                if region == FACE
-                else sample.regions.get(region)
+                np.ones(len(x), bool) if region == FACE else sample.regions.get(region)
             )
             if inside is None or not inside.any():
                 continue
@@ -172,10 +170,10 @@ def _colours(take: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
             raise InputError(Fault(str(name), rule, "a different sample", cure))
         by_landmark = _masks(registered, good)
     by_landmarks = frozenset(region for region in by_landmark if region not in stored)
-    colour = take[variables.DIFFUSE_REFLECTANCE].values[good].astype(np.float64)
+    colour = take[variables.DIFFUSE_REFLECTANCE].values[good].astype(float)
     return Colours(
         colour,
-        take[variables.SURFEL_AREA].values[good].astype(np.float64),
+        take[variables.SURFEL_AREA].values[good].astype(float),
         by_landmark | stored,
         by_landmarks,
     )

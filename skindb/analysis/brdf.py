@@ -37,7 +37,7 @@ from skindb.reflectance.reduction import Systems, factor_reflectance, residuals
 from skindb.reflectance.tables import TableGrid, brdf_metric
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
-from skindb.types import Array
+from skindb.types import Array, Float32, Index
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -188,9 +188,9 @@ def _mean(take: xr.Dataset) -> Array:
     good = np.isfinite(weights).all(axis=1)
     return np.asarray(
         np.average(
-            weights[good].astype(np.float64),
+            weights[good].astype(float),
             axis=0,
-            weights=area[good].astype(np.float64),
+            weights=area[good].astype(float),
         )
     )
 
@@ -205,7 +205,7 @@ def _fitted_weights(take: xr.Dataset) -> Array:
     is padded with NaN.
     """
     weights = take[variables.DICTIONARY_WEIGHT].values
-    return np.asarray(weights[np.isfinite(weights).all(axis=1)].astype(np.float64))
+    return np.asarray(weights[np.isfinite(weights).all(axis=1)].astype(float))
 
 
 def project(weights: Array, H: Array, metric: Array) -> Array:
@@ -510,17 +510,17 @@ def _surface_rows(
     fitted: xr.Dataset,
     tables: Array,
     eta: float,
-) -> tuple[tuple[NDArray[np.float32], NDArray[np.int64]], Array]:
+) -> tuple[tuple[Float32, Index], Array]:
     """Basis rows with their offsets, and the samples (total, 3) minus the diffuse term,
     for a few surfels.
     """
     position, normal = (
-        fitted[n].values.astype(np.float64)
+        fitted[n].values.astype(float)
         for n in (variables.SURFEL_POSITION, variables.SHADING_NORMAL)
     )
     to_light = _directions(dome[variables.LIGHT_POSITION].values, position)
     to_camera = _directions(dome[variables.CAMERA_POSITION].values, position)
-    values = samples.astype(np.float64)
+    values = samples.astype(float)
     rows, offsets, index = basis_rows(
         tables,
         TableGrid(*tables.shape[:3]),
@@ -538,13 +538,13 @@ def _surface_rows(
         * fresnel_transmittance(cos_o, eta)
         / np.pi
     )
-    diffuse = even_diffuse(fitted).astype(np.float64)[surfel] * passed[:, None]
+    diffuse = even_diffuse(fitted).astype(float)[surfel] * passed[:, None]
     return (rows, offsets), values[surfel, index[:, 0], index[:, 1]] - diffuse
 
 
 def _directions(points: Array, position: Array) -> Array:
     """Unit directions (n, p, 3) from the surfels to the points."""
-    d = points[None].astype(np.float64) - position[:, None]
+    d = points[None].astype(float) - position[:, None]
     return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True))
 
 

@@ -14,7 +14,7 @@ from skindb import plots
 from skindb.optics.angles import half_difference
 from skindb.reflectance.tables import lookup
 from skindb.schema import variables
-from skindb.types import Array
+from skindb.types import Array, Float32, Mask
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -189,7 +189,7 @@ def plot_space(space: xr.Dataset) -> Axes:
     return plot_brdf_space(space, ax=map_part.subplots())
 
 
-def sphere_radiance(tables: NDArray[Any]) -> tuple[Array, NDArray[np.bool_]]:
+def sphere_radiance(tables: NDArray[Any]) -> tuple[Array, Mask]:
     """Radiance (pixels, pixels, groups) of spheres per irradiance of the lights
     [sr^-1], and the mask of their pixels.
 
@@ -250,7 +250,7 @@ def _shaded(tables: NDArray[Any], normal: Array, light: Array) -> Array:
     return out
 
 
-def _tables(space: xr.Dataset) -> NDArray[np.float32]:
+def _tables(space: xr.Dataset) -> Float32:
     """Tables (nh, nd, np, group) of `group_brdf`, without the last azimuth, which
     repeats the first.
     """

@@ -377,7 +377,7 @@ def chromophore_table(
 
 def _density(maps: xr.Dataset) -> tuple[Array, Mask]:
     """-ln R_d (v, u, 3), 0 where nothing was measured, and the mask (v, u) of measured texels."""
-    albedo = maps[variables.TEXEL_DIFFUSE_REFLECTANCE].values.astype(np.float64)
+    albedo = maps[variables.TEXEL_DIFFUSE_REFLECTANCE].values.astype(float)
     measured = (maps[variables.TEXEL_COVERAGE].values > COVERED) & np.isfinite(
         albedo
     ).all(axis=-1)
@@ -394,7 +394,7 @@ def _sampled(maps: xr.Dataset, inside: Mask, count: int) -> _Sampled | None:
     rows, columns = np.nonzero(measured & inside)
     if not len(rows):
         return None
-    chosen = np.linspace(0, len(rows) - 1, count).round().astype(np.int64)
+    chosen = np.linspace(0, len(rows) - 1, count).round().astype(int)
     rows = rows[chosen]
     columns = columns[chosen]
     height, width = measured.shape

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb import plots
 from skindb.analysis.study import (
@@ -30,7 +29,7 @@ from skindb.render.image import encode_srgb, tone_map
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.notes import Note, note
-from skindb.types import Array, Mask
+from skindb.types import Array, Float64, Index, Mask
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -138,7 +137,7 @@ def _subject_maps(takes: xr.Dataset, names: list[str]) -> dict[str, Array]:
         take = takes[[*names, COVERAGE]].isel(take=i).load()
         measured = take[COVERAGE].values > COVERED
         for name in names:
-            values = take[name].values.astype(np.float64)
+            values = take[name].values.astype(float)
             is_known = (
                 measured if values.ndim == 2 else measured[..., None]
             ) & np.isfinite(values)
@@ -246,7 +245,7 @@ def principal_components(
 
 def _usable_entries(
     cohort: xr.Dataset, least_known: float
-) -> tuple[NDArray[np.intp], Mask, list[Note]]:
+) -> tuple[Index, Mask, list[Note]]:
     """Rows of the takes with enough known entries, the entries that all of them know,
     and notes on the other takes.
 
@@ -286,9 +285,7 @@ def _used_entries(take: xr.Dataset, is_used: Mask) -> Array:
     return np.asarray(take["values"].values.ravel()[is_used])
 
 
-def _expand(
-    values: Array, is_used: Mask, shape: tuple[int, ...]
-) -> NDArray[np.float64]:
+def _expand(values: Array, is_used: Mask, shape: tuple[int, ...]) -> Float64:
     """Arrange entries (..., used) as arrays (..., *shape); NaN where an entry was not used."""
     out = np.full((*values.shape[:-1], is_used.size), np.nan)
     out[..., is_used] = values

@@ -11,7 +11,6 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.analysis.study import Population
 from skindb.analysis.subjects import (
@@ -42,7 +41,7 @@ from skindb.numerics.inference import (
 from skindb.numerics.statistics import known_mean
 from skindb.parameters import ContrastParameters
 from skindb.schema import IDENTIFIED, variables
-from skindb.types import Array, Mask
+from skindb.types import Array, Index, Mask
 
 Result = TypeVar("Result")
 CHANNELS = ("R", "G", "B")
@@ -112,7 +111,7 @@ class Quantities:
         """The quantities of the named subjects, in their order."""
         return self._select([self.subject.index(name) for name in subjects])
 
-    def _select(self, rows: Sequence[int] | NDArray[np.intp]) -> Quantities:
+    def _select(self, rows: Sequence[int] | Index) -> Quantities:
         subject = tuple(self.subject[i] for i in rows)
         return replace(self, values=self.values[rows], subject=subject)
 
@@ -165,7 +164,7 @@ def _table_values(
     tables: xr.Dataset, variable: str, dims: tuple[str, ...], *, logarithmic: bool
 ) -> Array:
     """Values (take, q) of a variable, or the logarithms of identified ones."""
-    values = np.asarray(tables[variable].transpose("take", *dims).values, np.float64)
+    values = np.asarray(tables[variable].transpose("take", *dims).values, float)
     if logarithmic:
         identified = tables[variables.SITE_STATUS].isin(IDENTIFIED)
         good = identified.transpose("take", *dims).values & (values > 0)
@@ -272,7 +271,7 @@ def _regressors(attribute: Attribute, group_by: str) -> dict[str, Array]:
     indicators = {}
     for word in words:
         is_word = np.array([word_of(value) == word for value in attribute.values])
-        indicators[word] = np.where(is_known, is_word.astype(np.float64), np.nan)
+        indicators[word] = np.where(is_known, is_word.astype(float), np.nan)
     if len(words) == 2:
         return {f"{words[1]} less {words[0]}": indicators[words[1]]}
     return {f"{word} less others": indicators[word] for word in words}
@@ -390,7 +389,7 @@ def contrast_counts(contrast: Contrast) -> Array:
     """
     is_known = np.isfinite(contrast.quantities.values)
     is_with = (
-        np.ones(len(is_known), np.bool_)
+        np.ones(len(is_known), bool)
         if contrast.is_number or contrast.is_paired
         else contrast.regressor > 0
     )

@@ -93,7 +93,7 @@ def transfer_detail(
         axis=-1,
     )
     fitted = model["fitted"].to_dataset().load()
-    colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(np.float64)
+    colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(float)
     moved = with_albedo(
         fitted,
         colour * np.exp(at_surfels(change, registered[variables.COMMON_UV].values)),
@@ -157,7 +157,7 @@ def _region(
     region: str | Mask, registered: xr.Dataset, source_registered: xr.Dataset, size: int
 ) -> Mask:
     if not isinstance(region, str):
-        mask = np.asarray(region, np.bool_)
+        mask = np.asarray(region, bool)
         if mask.shape != (size, size):
             rule = f"a mask must have ({size}, {size}) texels"
             cure = "pass a mask of that shape, or another size"

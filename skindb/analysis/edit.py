@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.analysis.albedo import cumulative, decorrelate, histogram, levels, quantiles
 from skindb.analysis.brdf import project
@@ -21,8 +20,8 @@ from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, store
 from skindb.schema import GROUPS, Use, check, dataset, label, names_of, variables
 from skindb.schema.consent import honour_consent
 from skindb.schema.label import FACE, take_attrs
+from skindb.types import Array, Mask
 
-Array = NDArray[np.floating[Any]]
 Report = dict[str, Any]
 # limits of an edited albedo
 DARKEST = 1e-3
@@ -199,10 +198,10 @@ def _moved_surface(
     """Refit the surface to the basis of the population, and move its mean coefficients
     (component,) by the shift.
     """
-    weights = fitted[variables.DICTIONARY_WEIGHT].values.astype(np.float64)
+    weights = fitted[variables.DICTIONARY_WEIGHT].values.astype(float)
     good = np.isfinite(weights).all(axis=1)
-    area = fitted[variables.SURFEL_AREA].values[good].astype(np.float64)
-    H = basis[variables.POPULATION_MIXTURE].values.astype(np.float64)
+    area = fitted[variables.SURFEL_AREA].values[good].astype(float)
+    H = basis[variables.POPULATION_MIXTURE].values.astype(float)
     here = project(weights[good], H, metric)
     moved = np.full((len(weights), len(H)), np.nan)
     mean = np.average(here, axis=0, weights=area)
@@ -217,7 +216,7 @@ def _moved_surface(
     distance, move = _distances(
         target, mean, basis[variables.TAKE_COEFFICIENT].values, takes, gram
     )
-    report = _report(shift, step, np.zeros(len(area), np.bool_), area, distance)
+    report = _report(shift, step, np.zeros(len(area), bool), area, distance)
     report["clipped"] = float(_length(step - shift, gram)) / max(
         float(_length(shift, gram)), 1e-300
     )
@@ -245,11 +244,11 @@ def with_basis(
     """
     fitted = model["fitted"].to_dataset().load()
     tree = model.copy()
-    weights = fitted[variables.DICTIONARY_WEIGHT].values.astype(np.float64)
+    weights = fitted[variables.DICTIONARY_WEIGHT].values.astype(float)
     good = np.isfinite(weights).all(axis=1)
     coefficients = np.full((len(weights), len(mixture)), np.nan)
     coefficients[good] = project(
-        weights[good], np.asarray(mixture, np.float64), brdf_metric(tables)
+        weights[good], np.asarray(mixture, float), brdf_metric(tables)
     )
     rest = fitted.drop_dims("component")  # the components of another basis differ
     fitted = rest.assign(basis_weight=label(variables.BASIS_WEIGHT, coefficients))
@@ -304,7 +303,7 @@ def _moved_skin(
         shift = np.tensordot(amount, traits[variables.TRAIT_QUANTILE_SHIFT].values, 1)
         return _moved_albedo(fitted, shift, albedo)
     is_used = amount != 0
-    shifts = traits[TEXTURE_SHIFT].values[is_used].astype(np.float64)
+    shifts = traits[TEXTURE_SHIFT].values[is_used].astype(float)
     shift = np.tensordot(amount[is_used], shifts, 1)
     rng = np.random.default_rng(0) if rng is None else rng
     return _moved_texture(fitted, shift, mapped, albedo, rng)
@@ -322,7 +321,7 @@ def _moved_texture(
     """
     texture = mapped.texture
     edit = edit_texture(mapped.maps, shift, texture, rng=rng)
-    colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(np.float64)
+    colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(float)
     target = colour * np.exp(at_surfels(edit.change, mapped.uv))
     fitted, report, move = _with_albedo(fitted, target, albedo)
     report["distance"] = ONE_SUBJECT if edit.distance is None else edit.distance
@@ -347,7 +346,7 @@ def _moved_texture(
 
 def with_albedo(fitted: xr.Dataset, albedo: Array) -> xr.Dataset:
     """A fitted surface with new albedos (n, 3), limited to physical values."""
-    colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(np.float64)
+    colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(float)
     out = np.where(albedo == colour, colour, np.clip(albedo, DARKEST, BRIGHTEST))
     s, _ = dipole_s(out, eta=float(fitted[variables.REFRACTIVE_INDEX]))
     return fitted.assign(
@@ -362,11 +361,11 @@ def _with_albedo(
     """The fitted surface with new albedos (n, 3), the report of the change, and its distance."""
     moved = with_albedo(fitted, target)
     colour, out = (
-        version[variables.DIFFUSE_REFLECTANCE].values.astype(np.float64)
+        version[variables.DIFFUSE_REFLECTANCE].values.astype(float)
         for version in (fitted, moved)
     )
     good = np.isfinite(colour).all(axis=1)
-    area = fitted[variables.SURFEL_AREA].values[good].astype(np.float64)
+    area = fitted[variables.SURFEL_AREA].values[good].astype(float)
     before, now = (np.average(x[good], axis=0, weights=area) for x in (colour, out))
     face = [str(r) for r in albedo["region"].values].index(FACE)
     takes = albedo[variables.ALBEDO_MEAN].values[:, face]
@@ -386,7 +385,7 @@ def _moved_albedo(
     fitted: xr.Dataset, shift: Array, albedo: xr.Dataset
 ) -> tuple[xr.Dataset, Report, float]:
     """Shift the quantiles of albedo by the shift of the whole face."""
-    colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(np.float64)
+    colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(float)
     good = np.isfinite(colour).all(axis=1)
     mean, axes, edges = (
         albedo[n].values
@@ -396,7 +395,7 @@ def _moved_albedo(
             variables.HISTOGRAM_EDGE,
         )
     )
-    area = fitted[variables.SURFEL_AREA].values[good].astype(np.float64)
+    area = fitted[variables.SURFEL_AREA].values[good].astype(float)
     values = decorrelate(colour[good], mean, axes)
     here = histogram(np.clip(values, edges[:, 0], edges[:, -1]), area, edges)
     face = [str(r) for r in albedo["region"].values].index(FACE)
@@ -426,10 +425,10 @@ def _moved_sigma_tr(
     names them.
     """
     log, is_measured = _log_shift(amount, traits)
-    before = np.log(fitted[variables.SIGMA_TR].values.astype(np.float64))
+    before = np.log(fitted[variables.SIGMA_TR].values.astype(float))
     after = np.clip(before + log, *np.log(SIGMA_TR_RANGE))
     good = np.isfinite(before).all(axis=1)
-    area = fitted[variables.SURFEL_AREA].values[good].astype(np.float64)
+    area = fitted[variables.SURFEL_AREA].values[good].astype(float)
     mean, now = (np.average(x[good], axis=0, weights=area) for x in (before, after))
     population = traits[variables.TAKE_LOG_SIGMA_TR]
     measured = np.isfinite(population.values).all(axis=1)
@@ -478,14 +477,14 @@ def _moved_sites(sites: xr.Dataset, amount: Array, traits: xr.Dataset) -> xr.Dat
     """
     log, _ = _log_shift(amount, traits)
     moved = np.clip(
-        sites[variables.SITE_SIGMA_TR].values.astype(np.float64) * np.exp(log),
+        sites[variables.SITE_SIGMA_TR].values.astype(float) * np.exp(log),
         *SIGMA_TR_RANGE,
     )
     moved_sites = surviving(sites).drop_attrs(deep=False)
     return moved_sites.assign(site_sigma_tr=label(variables.SITE_SIGMA_TR, moved))
 
 
-def _log_shift(amount: Array, traits: xr.Dataset) -> tuple[Array, NDArray[np.bool_]]:
+def _log_shift(amount: Array, traits: xr.Dataset) -> tuple[Array, Mask]:
     """Shift of log sigma_tr (channel,), and the mask (trait,) of the traits with a
     measured shift.
     """
@@ -497,7 +496,7 @@ def _log_shift(amount: Array, traits: xr.Dataset) -> tuple[Array, NDArray[np.boo
 def _report(
     requested: Array,
     applied: Array,
-    cut: NDArray[np.bool_],
+    cut: Mask,
     area: Array,
     distance: float | str,
 ) -> Report:

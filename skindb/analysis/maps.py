@@ -225,7 +225,7 @@ def _block_means(take: xr.Dataset, variable: str, size: int) -> Array:
     """Means (size * size * channels,) of the measured texels in blocks of texels; NaN
     where too few were measured.
     """
-    values = take[variable].values.astype(np.float64)
+    values = take[variable].values.astype(float)
     values = values.reshape(*values.shape[:2], -1)
     if variable.endswith(LOGARITHMIC):
         values = np.log(np.where(values > 0, values, np.nan))
@@ -257,7 +257,7 @@ def _texel_statistics(
         raise ValueError(
             f"no texel with values of {min_fraction:.0%} of the {len(values)} subjects"
         )
-    test = contrast_test(contrast, values[:, able].astype(np.float64), max_draws, rng)
+    test = contrast_test(contrast, values[:, able].astype(float), max_draws, rng)
     statistics = {
         variables.MAP_EFFECT: test.effects.slope,
         variables.MAP_EFFECT_HALF_WIDTH: (test.effects.high - test.effects.low) / 2,

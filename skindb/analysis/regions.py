@@ -53,7 +53,7 @@ def region_masks(common_uv: Array, landmarks: Mapping[str, Array]) -> dict[str, 
         skin of forehead, nose and cheeks outside the beard.
     """
     places = {
-        name: np.asarray(p, np.float64)
+        name: np.asarray(p, float)
         for name, p in landmarks.items()
         if np.isfinite(p).all()
     }
@@ -61,7 +61,7 @@ def region_masks(common_uv: Array, landmarks: Mapping[str, Array]) -> dict[str, 
         corners = (places["mouth_corner_right"] + places["mouth_corner_left"]) / 2
         places["lip_lower"] = corners + LOWER_LIP * (corners - places["lip_upper"])
     drawn = {name: _region_mask(name, common_uv, places) for name in (*FINE, "beard")}
-    taken = np.zeros(len(common_uv), np.bool_)
+    taken = np.zeros(len(common_uv), bool)
     masks: dict[str, Mask] = {}
     for name in FINE:
         if (mask := drawn[name]) is not None:
@@ -82,7 +82,7 @@ def map_regions(landmarks: Mapping[str, Array], size: int) -> dict[str, Mask]:
     """
     centre = (np.arange(size) + 0.5) / size
     points = np.stack(np.meshgrid(centre, centre), axis=-1).reshape(-1, 2)
-    masks = {FACE: np.ones(len(points), np.bool_)} | region_masks(points, landmarks)
+    masks = {FACE: np.ones(len(points), bool)} | region_masks(points, landmarks)
     return {name: mask.reshape(size, size) for name, mask in masks.items()}
 
 
@@ -192,7 +192,7 @@ def _corners(
 
 def inside_outline(points: Array, outline: Array) -> Mask:
     """Whether points (n, 2) lie inside a closed outline (m, 2), by the even-odd rule."""
-    inside = np.zeros(len(points), np.bool_)
+    inside = np.zeros(len(points), bool)
     x = points[:, 0]
     y = points[:, 1]
     for (ax, ay), (bx, by) in zip(outline, np.roll(outline, -1, axis=0), strict=True):

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.geometry.atlas import signed_areas
@@ -30,8 +29,8 @@ from skindb.geometry.warp import (
 from skindb.schema import dataset, variables
 from skindb.schema.consent import honour_consent
 from skindb.schema.notes import Note, note
+from skindb.types import Array, Float64, Index
 
-Array = NDArray[np.floating[Any]]
 Takes = Mapping[str, xr.DataTree]
 Registered = Mapping[str, xr.Dataset]
 MEAN = "mean"
@@ -85,8 +84,8 @@ class Outline:
     takes fit into memory.
     """
 
-    landmark: NDArray[np.float64]  # (k, 3) mm
-    landmark_uv: NDArray[np.float64]  # (k, 2)
+    landmark: Float64  # (k, 3) mm
+    landmark_uv: Float64  # (k, 2)
     area: float  # mm2
     alignable: bool  # whether the surface can be aligned with a template
 
@@ -97,8 +96,8 @@ class Frame:
 
     names: tuple[str, ...]  # of the landmarks
     # take -> (k, 2) landmarks in the (u, v) of the take
-    at: Mapping[str, NDArray[np.float64]]
-    target: NDArray[np.float64]  # (k, 2) landmarks in the common (u, v)
+    at: Mapping[str, Float64]
+    target: Float64  # (k, 2) landmarks in the common (u, v)
     template: str
     reference: str
     smoothing: float | None
@@ -135,7 +134,7 @@ def outline(model: xr.DataTree, names: Sequence[str]) -> Outline:
     """Outline of a take, the input of `common_frame`."""
     sheet = _sheet(model, list(names))
     return Outline(
-        np.asarray(sheet.landmark, np.float64),
+        np.asarray(sheet.landmark, float),
         _landmark_uv(sheet),
         sheet.area(),
         sheet.alignable(),
@@ -267,7 +266,7 @@ def _sheet(model: xr.DataTree, names: list[str]) -> Sheet:
     return Sheet.of(*_surface(model), landmark)
 
 
-def _landmark_uv(sheet: Sheet) -> NDArray[np.float64]:
+def _landmark_uv(sheet: Sheet) -> Float64:
     """Texture coordinates (k, 2) of the surface points nearest to the landmarks; NaN
     for landmarks that are missing.
     """
@@ -280,7 +279,7 @@ def _landmark_uv(sheet: Sheet) -> NDArray[np.float64]:
     return out
 
 
-def _landmarks_mm(model: xr.DataTree) -> NDArray[np.float64]:
+def _landmarks_mm(model: xr.DataTree) -> Float64:
     return np.asarray(
         model["mesh"].to_dataset()[variables.LANDMARK_POSITION].values, np.float64
     )
@@ -343,7 +342,7 @@ def _registration_dataset(
 
 def corresponding_points(
     model: xr.DataTree, registered: xr.Dataset, common: Array
-) -> NDArray[np.float64]:
+) -> Float64:
     """Surface points (n, 3) [mm] of a take at common texture coordinates (n, 2); NaN
     outside its surface.
     """
@@ -351,14 +350,10 @@ def corresponding_points(
     # the map has no folds: a ray perpendicular to the plane meets the only triangle
     # that contains the point
     flat = RayScene(
-        np.pad(
-            registered[variables.COMMON_UV].values.astype(np.float64), ((0, 0), (0, 1))
-        ),
+        np.pad(registered[variables.COMMON_UV].values.astype(float), ((0, 0), (0, 1))),
         faces,
     )
-    start = np.pad(
-        np.asarray(common, np.float64), ((0, 0), (0, 1)), constant_values=HEIGHT
-    )
+    start = np.pad(np.asarray(common, float), ((0, 0), (0, 1)), constant_values=HEIGHT)
     face, corner, _ = flat.first_hit(start, np.array([[0.0, 0.0, -1.0]]))
     return np.where(
         (face >= 0)[:, None],
@@ -369,7 +364,7 @@ def corresponding_points(
 
 def correspondence_error(
     models: Takes, registered: Registered, points: Mapping[str, Array]
-) -> NDArray[np.float64]:
+) -> Float64:
     """Errors of correspondences at points where the true ones are known.
 
     Parameters
@@ -568,23 +563,19 @@ def describe_registration(registered: Registered, takes: Iterable[str]) -> list[
 
 def _surface(
     model: xr.DataTree,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+) -> tuple[Float64, Float64, Index]:
     """Positions (n, 3) in mm, texture coordinates (n, 2) and triangles (f, 3) of a take."""
     fitted = model["fitted"].to_dataset()
     faces = model["mesh"].to_dataset()[variables.TRIANGLE].values
     position, uv = (
-        fitted[name].values.astype(np.float64)
+        fitted[name].values.astype(float)
         for name in (variables.SURFEL_POSITION, variables.SURFEL_UV)
     )
-    return position, uv, faces.astype(np.int64)
+    return position, uv, faces.astype(int)
 
 
-def _interpolate(
-    values: Array, corners: NDArray[np.int64], corner: Array
-) -> NDArray[np.float64]:
+def _interpolate(values: Array, corners: Index, corner: Array) -> Float64:
     """Values (n, c) at barycentric coordinates `corner` (n, 3) of triangles with the
     vertices `at` (n, 3).
     """
-    return np.asarray(
-        np.einsum("nk,nkc->nc", corner, values[corners].astype(np.float64))
-    )
+    return np.asarray(np.einsum("nk,nkc->nc", corner, values[corners].astype(float)))

@@ -127,9 +127,9 @@ class Subjects:
     def is_normal(self) -> Mask:
         """Mask (take,) of the takes in the condition normal."""
         if CONDITION not in self.attributes:
-            return np.ones(len(self.take), np.bool_)
+            return np.ones(len(self.take), bool)
         conditions = self.attributes[CONDITION].values
-        return np.array([value == NORMAL for value in conditions], np.bool_)
+        return np.array([value == NORMAL for value in conditions], bool)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -164,7 +164,7 @@ class Subjects:
 
     def rows_of(self, subject: str) -> Mask:
         """Mask (take,) of the takes of a subject."""
-        return np.array([name == subject for name in self.subject], np.bool_)
+        return np.array([name == subject for name in self.subject], bool)
 
 
 def subjects_of(cohort: xr.Dataset) -> Subjects:
@@ -333,9 +333,9 @@ def has_trait(subjects: Subjects, trait: str) -> Mask:
                 age_of.setdefault(subject, age)
         return np.asarray(ages > (np.median([*age_of.values()]) if age_of else np.inf))
     if name not in subjects.attributes:
-        return np.zeros(len(subjects.take), np.bool_)
+        return np.zeros(len(subjects.take), bool)
     values = subjects.attributes[name].values
-    return np.array([v == value if value else v is True for v in values], np.bool_)
+    return np.array([v == value if value else v is True for v in values], bool)
 
 
 def has_attribute(subjects: Subjects, trait: str) -> Mask:
@@ -344,9 +344,9 @@ def has_attribute(subjects: Subjects, trait: str) -> Mask:
         return np.isfinite(number_of_takes(subjects, AGE))
     name = trait.partition(":")[0]
     if name not in subjects.attributes:
-        return np.zeros(len(subjects.take), np.bool_)
+        return np.zeros(len(subjects.take), bool)
     values = subjects.attributes[name].values
-    return np.array([value is not None for value in values], np.bool_)
+    return np.array([value is not None for value in values], bool)
 
 
 def comparable_takes(subjects: Subjects, trait: str) -> Mask:

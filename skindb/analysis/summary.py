@@ -21,7 +21,7 @@ from skindb.schema.consent import consent_scope
 from skindb.schema.declaration import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
 from skindb.schema.label import FACE
 from skindb.schema.notes import note
-from skindb.types import Array, Mask
+from skindb.types import Array, Index, Mask
 
 # surfels per take; the paper drew 2,000 of each subject, and 5,000 for the conditions
 # of one subject
@@ -91,7 +91,7 @@ def summary_tables(model: xr.DataTree) -> xr.Dataset:
         errors at held-out samples.
     """
     fitted = model["fitted"].to_dataset().load()
-    masks = {FACE: np.ones(fitted.sizes["surfel"], np.bool_)} | own_masks(fitted)
+    masks = {FACE: np.ones(fitted.sizes["surfel"], bool)} | own_masks(fitted)
     parts = [
         region_tables(fitted, masks),
         _basis_tables(model, fitted),
@@ -127,8 +127,8 @@ def region_tables(fitted: xr.Dataset, masks: Mapping[str, Mask]) -> xr.Dataset:
         for a region without trusted surfels.
     """
     trusted = trusted_surfels(fitted)
-    area = fitted[variables.SURFEL_AREA].values.astype(np.float64)
-    colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(np.float64)
+    area = fitted[variables.SURFEL_AREA].values.astype(float)
+    colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(float)
     noise, total = (
         _values(fitted, f"diffuse_reflectance_{name}", (3,))
         for name in ("error", "total_error")
@@ -221,8 +221,8 @@ def _basis_tables(model: xr.DataTree, fitted: xr.Dataset) -> xr.Dataset:
     good = np.isfinite(fitted[variables.BASIS_WEIGHT].values).all(axis=1) & (
         fitted[variables.FIT_STATUS].values == FitStatus.FITTED
     )
-    area = fitted[variables.SURFEL_AREA].values[good].astype(np.float64)
-    weights = fitted[variables.BASIS_WEIGHT].values[good].astype(np.float64)
+    area = fitted[variables.SURFEL_AREA].values[good].astype(float)
+    weights = fitted[variables.BASIS_WEIGHT].values[good].astype(float)
     mean = (
         np.average(weights, axis=0, weights=area)
         if good.any()
@@ -259,7 +259,7 @@ def _values(fitted: xr.Dataset, name: str, shape: tuple[int, ...]) -> Array:
     """Values (surfel, *shape) of a variable; NaN if the model does not have it."""
     shape_of_all = (fitted.sizes["surfel"], *shape)
     return np.asarray(
-        fitted[name].values.astype(np.float64)
+        fitted[name].values.astype(float)
         if name in fitted
         else np.full(shape_of_all, np.nan)
     )
@@ -363,7 +363,7 @@ def cohort_of(
     )
 
 
-def _samples_of(capture: xr.DataTree, index: NDArray[np.int64]) -> xr.Dataset:
+def _samples_of(capture: xr.DataTree, index: Index) -> xr.Dataset:
     """Reflectance samples of the selected surfels, and the positions of the lights and
     cameras of the dome.
     """

@@ -49,7 +49,7 @@ from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, store
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
 from skindb.threads import c_contiguous
-from skindb.types import Array
+from skindb.types import Array, Mask
 
 # subjects of a group, below which p values are approximate if the groups have different
 # variances
@@ -82,7 +82,7 @@ class _Subjects:
     place: Array
 
     @property
-    def measured(self) -> NDArray[np.bool_]:
+    def measured(self) -> Mask:
         """Mask (subject, group) of the groups in which a subject was measured."""
         return np.asarray(np.isfinite(self.place).all(axis=2))
 
@@ -151,9 +151,7 @@ def brdf_space(
     takes, named, flags = grouped_takes(cohort, group_by)
     coefficient = _coefficients(takes.take, basis)
     [(metric, brdf)] = each_item(
-        _metric_and_basis(
-            basis[variables.POPULATION_MIXTURE].values.astype(np.float64)
-        ),
+        _metric_and_basis(basis[variables.POPULATION_MIXTURE].values.astype(float)),
         [tables],
     )
     place = coefficient @ _metric_root(metric)
@@ -270,7 +268,7 @@ def _coefficients(names: Sequence[str], basis: xr.Dataset) -> Array:
     """Coefficients (take, component) of the takes; raises `InputError` for missing ones
     and for a dependent basis.
     """
-    mixture = basis[variables.POPULATION_MIXTURE].values.astype(np.float64)
+    mixture = basis[variables.POPULATION_MIXTURE].values.astype(float)
     lengths = np.linalg.norm(mixture, axis=1, keepdims=True)
     values = np.linalg.svd(
         mixture / np.where(lengths > 0, lengths, 1.0), compute_uv=False
@@ -287,7 +285,7 @@ def _coefficients(names: Sequence[str], basis: xr.Dataset) -> Array:
             )
         )
     row_of = {str(take): i for i, take in enumerate(basis["take"].values)}
-    stored = basis[variables.TAKE_COEFFICIENT].values.astype(np.float64)
+    stored = basis[variables.TAKE_COEFFICIENT].values.astype(float)
     bad = [
         name
         for name in names

@@ -167,7 +167,7 @@ def _moments(maps: xr.Dataset) -> Moments | None:
     log, measured = log_albedo(maps)
     if not measured.any():
         return None
-    inside = log[measured].astype(np.float64)
+    inside = log[measured].astype(float)
     return Moments(inside.mean(axis=0), np.cov(inside.T, bias=True))
 
 
@@ -348,7 +348,7 @@ def edit_texture(
     images = decorrelated(log, mean, axes)
 
     def synthesised(axis: int, result: np.random.Generator) -> Synthesis:
-        target = shift[matched, axis].astype(np.float64)
+        target = shift[matched, axis].astype(float)
         return synthesise(
             images[axis],
             regions,
@@ -406,7 +406,7 @@ def _distances(
     for takes of the population. None if there are too few takes.
     """
     quantiles_of_takes = (
-        texture[variables.TEXTURE_QUANTILE].values[:, matched].astype(np.float64)
+        texture[variables.TEXTURE_QUANTILE].values[:, matched].astype(float)
     )
     quantiles_of_takes = quantiles_of_takes.reshape(len(quantiles_of_takes), -1)
     rows = quantiles_of_takes[

@@ -42,7 +42,7 @@ from skindb.parameters import DICTIONARY_HELP, adjust_option, option, seed_optio
 from skindb.schema import IDENTIFIED, dataset, variables
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.label import FACE
-from skindb.types import Array, Mask
+from skindb.types import Array, Mask, float64
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -256,7 +256,7 @@ def _shifts(
         drawn = rng.multinomial(count, np.full(count, 1 / count), RESAMPLES)
         for name, of_takes in values.items():
             with_errors = name not in WITHOUT_ERRORS
-            resamples = drawn[: None if with_errors else 0].astype(np.float64)
+            resamples = drawn[: None if with_errors else 0].astype(float)
             shift, resampled = _coefficients(
                 unit.values(of_takes), unit.design, resamples
             )
@@ -283,7 +283,7 @@ def _sides(subjects: Subjects, trait: str, numbers: Sequence[str]) -> tuple[Mask
     if trait not in numbers:
         return sides(subjects, trait)
     is_known = np.isfinite(number_of_takes(subjects, trait)) & subjects.is_normal
-    return is_known, np.zeros(len(is_known), np.bool_)
+    return is_known, np.zeros(len(is_known), bool)
 
 
 def _units(
@@ -430,9 +430,7 @@ def _log_sigma_tr(cohort: xr.Dataset) -> Array:
         return np.full((cohort.sizes["take"], 1, 3), np.nan)
     node = cohort[[variables.SITE_SIGMA_TR, variables.SITE_STATUS]].load()
     good = node[variables.SITE_STATUS].isin(IDENTIFIED)
-    return np.log(
-        np.asarray(node[variables.SITE_SIGMA_TR].where(good).values, np.float64)
-    )
+    return np.log(float64(node[variables.SITE_SIGMA_TR].where(good).values))
 
 
 def describe_traits(traits: xr.Dataset) -> list[str]:

@@ -178,7 +178,7 @@ def _trusted(takes: xr.Dataset) -> dict[str, Array]:
     node = takes[[name for name in names if name in takes]].load()
     good = node[variables.SITE_STATUS].isin(IDENTIFIED)
     return {
-        str(name): np.asarray(node[name].where(good).values, np.float64)
+        str(name): np.asarray(node[name].where(good).values, float)
         for name in node
         if name != names[-1]
     }

@@ -22,7 +22,7 @@ from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.mixture import basis_rows
 from skindb.reflectance.separation import surface_lobes
 from skindb.schema import dataset, label, variables
-from skindb.types import Array
+from skindb.types import Array, Mask
 from skindb.virtual.dome import Sensor
 
 ETA = 1.3
@@ -316,7 +316,7 @@ def _longest_exposure(
 ) -> Array:
     radiance = np.full(frames[0].shape, np.nan)
     for frame, seconds in zip(frames, times, strict=True):  # from short to long
-        level = frame.astype(np.float64) - sensor.black
+        level = frame.astype(float) - sensor.black
         level = level / (sensor.white - sensor.black) / seconds
         radiance = np.where(frame < sensor.white, level, radiance)
     return radiance
@@ -328,7 +328,7 @@ def _radiance(
     seconds: float,
     radiance: Array,
     truth: Array,
-    usable: NDArray[np.bool],
+    usable: Mask,
     failure: str = "",
 ) -> Point:
     relative = np.abs(radiance[usable] / truth[usable] - 1)

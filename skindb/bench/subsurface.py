@@ -9,7 +9,6 @@ from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from skindb.bench.curve import Curve, Point, cpu_time
@@ -34,7 +33,7 @@ from skindb.optics.transport import (
     radial_profile,
     random_walk,
 )
-from skindb.types import Array
+from skindb.types import Array, Float32
 
 ETA = 1.3
 DISTANCE = (0.5, 1.0, 2.0, 5.0, 10.0)  # transport mean free paths
@@ -80,7 +79,7 @@ def inverse_curves(quick: bool) -> list[Curve]:
     seconds_of_brentq, of_brentq = cpu_time(partial(_by_brentq, diffuse), count)
     albedo = reduced_albedo(exact)
     from_double = np.sqrt(3 * (1 - albedo))
-    from_single = np.sqrt(3 * (1 - albedo.astype(np.float32).astype(np.float64)))
+    from_single = np.sqrt(3 * (1 - albedo.astype(np.float32).astype(float)))
     s_bright = _exact(0.999)
     lost = (1 - np.float32(reduced_albedo(s_bright))) / (s_bright**2 / 3) - 1
     brentq_fails = "1 - R_d(s) is lost to cancellation where R_d is near 1"
@@ -385,7 +384,7 @@ def _ball(spacing: float) -> tuple[Array, Array, Array]:
 
 def _octree(
     points: Array, areas: Array, irradiance: Array, tolerance: float
-) -> NDArray[np.float32]:
+) -> Float32:
     s = np.tile(dipole_s(BALL_R_D, eta=ETA)[0], (len(points), 1))
     transport = np.tile(BALL_SIGMA_TR, (len(points), 1))
     return subsurface_exitance(

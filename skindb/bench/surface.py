@@ -31,7 +31,7 @@ from skindb.reflectance.mixture import Mixture, basis_rows
 from skindb.reflectance.model import Block, Comparison, SurfaceFit
 from skindb.reflectance.reduction import reduce_dictionary
 from skindb.reflectance.tables import brdf_metric, lookup
-from skindb.types import Array
+from skindb.types import Array, Index
 
 ETA = 1.3
 DISC = float(np.radians(0.8))
@@ -45,7 +45,7 @@ TRUTH = (
 SCIPY = "SciPy nnls, precomputed rows, three channels"
 COMPONENTS = 6  # of the planted factorisation
 
-Nodes = tuple[NDArray[np.int64], ...]  # indices of nodes of tables
+Nodes = tuple[Index, ...]  # indices of nodes of tables
 Predict = Callable[[slice, int], Array]  # surface reflectance of rows of a surfel
 
 
@@ -143,7 +143,7 @@ def strip(
     target = sample[surfel, i, o].astype(float) - scattered
     block = Block(sample, position, light, camera, normal, diffuse)
     away = wi[surfel, i], wo[surfel, o], normal[surfel]
-    return Strip(block, offsets, rows.astype(np.float64), target, true, away, c)
+    return Strip(block, offsets, rows.astype(float), target, true, away, c)
 
 
 @lru_cache(maxsize=1)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from skindb.calibration._merge_kernels import OK
 from skindb.calibration.lens import fit_edge, fit_vignette, veiling_glare
@@ -41,7 +41,7 @@ from skindb.format.dome import (
     Pinhole,
 )
 from skindb.schema import dataset
-from skindb.types import Float64, Mask
+from skindb.types import Float32, Float64, Mask
 
 # the manufacturer's reference values, as in colour-science
 CHART = "ColorChecker24 - After November 2014"
@@ -131,7 +131,7 @@ def fit_colour_matrix(patches: ArrayLike) -> ColourFit:
     InputError
         Wrong shapes, too few usable patches, an unusable white patch, or patches of one colour.
     """
-    values = np.asarray(patches, np.float64)
+    values = np.asarray(patches, float)
     target = chart_reference()
     require(
         values.shape == target.shape,
@@ -170,7 +170,7 @@ def _least_squares(camera: Float64, target: Float64) -> tuple[Float64, Float64]:
     residual = target - camera @ solution
     variance = (residual**2).sum(axis=0) / max(len(camera) - 3, 1)
     error = np.sqrt(variance[:, None] * np.diag(np.linalg.inv(camera.T @ camera)))
-    return np.asarray(solution, np.float64), error
+    return np.asarray(solution, float), error
 
 
 def _difference(measured: Float64, expected: Float64) -> Float64:
@@ -394,7 +394,7 @@ def _chart(
 def _edge(
     frames: CalibrationFrames, kind: CameraFrames, camera: CameraRecord
 ) -> tuple[CameraRecord, Values]:
-    picture = _merged(frames, kind.frames, camera)[..., GREEN].astype(np.float64)
+    picture = _merged(frames, kind.frames, camera)[..., GREEN].astype(float)
     (left, top), (right, bottom) = np.sort(kind.places[camera.id], axis=0).astype(int)
     edge = fit_edge(picture[top:bottom, left:right])
     mean = float(np.nanmean(picture))
@@ -422,9 +422,7 @@ def _reprojection(points: KnownPoints, camera: CameraRecord) -> Values:
     return {"reprojection_rms": error.rms, "reprojection_max": error.largest}
 
 
-def _merged(
-    frames: CalibrationFrames, template: str, camera: CameraRecord
-) -> NDArray[np.float32]:
+def _merged(frames: CalibrationFrames, template: str, camera: CameraRecord) -> Float32:
     """Radiance (h, w, 3) in the colours of the sensor, NaN where it is saturated."""
     exposures = [sets[0] for sets in frames.read(template, camera, frames.exposures)]
     gain = vignette_gain(camera) if camera.vignette.any() else None
@@ -465,7 +463,7 @@ def reprojection_error(
     InputError
         No point remains.
     """
-    residual = np.asarray(pixels, np.float64) - camera.project(points)
+    residual = np.asarray(pixels, float) - camera.project(points)
     length = np.linalg.norm(residual, axis=-1)
     observed = length[np.isfinite(length)]
     require(

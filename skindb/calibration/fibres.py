@@ -20,7 +20,7 @@ from skindb.format.frames import Digests, Frame, read_frame, read_frames
 from skindb.limits import MAX_FIBRE_PIXELS
 from skindb.numerics.statistics import robust_deviation
 from skindb.schema import dataset
-from skindb.types import Float64, Index, Mask
+from skindb.types import Float64, Index, Mask, float64
 
 # fraction of a fibre's pixels that may be missing in a channel (stuck ones): for a
 # fibre whose centre is 50 % above its mean brightness, the signal is then 0.5 % too
@@ -76,8 +76,8 @@ def _fibre_means(radiance: Image, error: Image) -> tuple[Float64, Float64]:
     """
     value = np.full(3, np.nan)
     spread = np.full(3, np.nan)
-    signal = radiance.astype(np.float64)
-    noise = error.astype(np.float64)
+    signal = radiance.astype(float)
+    noise = error.astype(float)
     for c in range(3):
         usable = np.isfinite(signal[:, c])
         if 1 - usable.mean() <= MAX_LOST_FRACTION:
@@ -198,7 +198,7 @@ def _green(flat: ProbeRecord, site: str) -> Float64:
     for top in range(0, frames[0].shape[0], ROWS):
         strip = [frame[top : top + ROWS] for frame in frames]
         strips.append(merge_exposures(strip, seconds, flat.sensor)[0][..., GREEN])
-    green = np.concatenate(strips).astype(np.float64)
+    green = float64(np.concatenate(strips))
     return np.nan_to_num(green, nan=float(np.nanmax(green, initial=0.0)))
 
 
@@ -274,7 +274,7 @@ def find_fibres(picture: ArrayLike, *, count: int) -> Spots:
     InputError
         The picture is not finite, or another number of spots is found.
     """
-    grey = np.asarray(picture, np.float64)
+    grey = np.asarray(picture, float)
     require(
         grey.ndim == 2 and np.isfinite(grey).all(),
         "picture of the fibres",
@@ -348,7 +348,7 @@ def match_fibres(spots: Spots, stated: Spots) -> SpotOffsets:
         "correct the centres",
     )
     ratio = spots.radius[order] / stated.radius
-    return SpotOffsets(offset, ratio, np.asarray(order, np.int64))
+    return SpotOffsets(offset, ratio, np.asarray(order, int))
 
 
 def fibre_gain(signal: ArrayLike) -> FibreGain:
@@ -368,7 +368,7 @@ def fibre_gain(signal: ArrayLike) -> FibreGain:
     InputError
         Too few frames, or signals that are not positive and finite.
     """
-    values = np.asarray(signal, np.float64)
+    values = np.asarray(signal, float)
     shaped = values.ndim == 3 and values.shape[2] == 3 and values.shape[1] > 1
     require(
         shaped

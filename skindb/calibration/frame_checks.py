@@ -10,7 +10,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.calibration.radiance import (
     FrameMerger,
@@ -24,9 +23,7 @@ from skindb.format.fields import MAX_MAGNITUDE
 from skindb.format.frames import Digests, Frame, read_frame
 from skindb.format.sensor import SensorRecord
 from skindb.numerics.statistics import correlation, robust_deviation
-from skindb.types import Float64, Mask
-
-Array = NDArray[np.float32]
+from skindb.types import Float32, Float64, Mask
 
 # of a frame, evenly spread: takes 1 % of the time to decode 10 megapixels
 MAX_COMPARED_PIXELS = 40_000
@@ -179,8 +176,8 @@ def disagreement(
 
 def _radiance_ratio(
     sensor: SensorRecord,
-    short: tuple[Frame, Array, float],
-    long: tuple[Frame, Array, float],
+    short: tuple[Frame, Float32, float],
+    long: tuple[Frame, Float32, float],
 ) -> tuple[float, float]:
     """Median ratio of the radiance of a short exposure to that of a long one, and the
     fraction of values that differ.
@@ -493,7 +490,7 @@ def _alternatives(
             yield f"those of camera {name} match its photographs", other_dark[exposure]
 
 
-def _pattern(frame: Frame | Array, chosen: Mask) -> Array:
+def _pattern(frame: Frame | Float32, chosen: Mask) -> Float32:
     """Differences (n,) of chosen values (h, w - 2, 3) from both neighbours in their
     row, without outliers.
     """

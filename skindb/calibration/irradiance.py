@@ -181,7 +181,7 @@ def _intensities(
         "point, normal and half_size must be those of the target, and its frames "
         "must show it and not the face",
     )
-    return np.asarray(values, np.float64)
+    return np.asarray(values, float)
 
 
 def unevenness(values: Float64) -> float:
@@ -291,7 +291,7 @@ def fit_light(target: TargetPixels, *, falloff: float | None = None) -> LightFit
     InputError
         Wrong shapes, too few usable pixels, or more than half of them in shadow.
     """
-    radiance = np.asarray(target.radiance, np.float64)
+    radiance = np.asarray(target.radiance, float)
     require(
         radiance.shape == np.shape(target.points) == (len(radiance), 3),
         "white target",

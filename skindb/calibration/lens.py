@@ -66,7 +66,7 @@ def fit_edge(picture: ArrayLike) -> EdgeFit:
     InputError
         The picture is too small, not finite, has no edge, or the edge is not slanted.
     """
-    grey = np.asarray(picture, np.float64)
+    grey = np.asarray(picture, float)
     require(
         grey.ndim == 2 and min(grey.shape) >= 16 and np.isfinite(grey).all(),
         "slanted edge",
@@ -208,8 +208,8 @@ def fit_vignette(flat: ArrayLike, centre: ArrayLike) -> Vignette:
         Too few pixels are finite and positive, or they do not reach far enough from the
         principal point.
     """
-    picture = np.asarray(flat, np.float64)
-    middle = np.asarray(centre, np.float64)
+    picture = np.asarray(flat, float)
+    middle = np.asarray(centre, float)
     require(
         picture.ndim == 2,
         "flat frame",
@@ -257,4 +257,4 @@ def _robust_fit(design: Float64, value: Float64) -> tuple[Float64, Float64, Mask
         spread = float(robust_deviation(residual[inliers]))
         limit = MAX_DEVIATIONS * max(spread, 1e-12 * abs(solution[0]))
         inliers = np.abs(residual) <= limit
-    return np.asarray(solution, np.float64), residual, np.asarray(inliers)
+    return np.asarray(solution, float), residual, np.asarray(inliers)

@@ -126,7 +126,7 @@ def highlight_centre(picture: ArrayLike, outline: Outline) -> Float64:
     InputError
         The picture is not finite or even, or the bright spot is too large for a highlight.
     """
-    grey = np.asarray(picture, np.float64)
+    grey = np.asarray(picture, float)
     grey = grey.mean(axis=-1) if grey.ndim == 3 else grey
     row, column = np.mgrid[: grey.shape[0], : grey.shape[1]] + 0.5
     x, y = outline.centre
@@ -166,7 +166,7 @@ def distant_light(outline: Outline, highlight: ArrayLike) -> Float64:
     The view along -z is reflected at the normal of the ball under the highlight (2,)
     px: l = 2 (n . v) n - v.
     """
-    away = np.asarray(highlight, np.float64) - outline.centre
+    away = np.asarray(highlight, float) - outline.centre
     offset = away / outline.radius * [1, -1]
     square = float(offset @ offset)
     require(
@@ -201,8 +201,8 @@ def reflected_ray(
     InputError
         The line of sight misses the ball.
     """
-    view = camera.rays(np.asarray(highlight, np.float64))
-    centre = np.asarray(ball, np.float64)
+    view = camera.rays(np.asarray(highlight, float))
+    centre = np.asarray(ball, float)
     way = centre - camera.centre
     along = float(way @ view)
     square = float(way @ way)
@@ -246,12 +246,12 @@ def ball_centre(
     around = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     directions = list[Float64]()
     distances = list[float]()
-    for camera, circle in zip(cameras, np.asarray(outlines, np.float64), strict=True):
+    for camera, circle in zip(cameras, np.asarray(outlines, float), strict=True):
         sight = camera.rays(circle[:2] + circle[2] * around)
         # all lines make the same angle with the axis: sight . axis = cos(angle)
         axis = np.linalg.lstsq(sight, np.ones(OUTLINE_POINTS))[0]
         length = float(np.linalg.norm(axis))
-        directions.append(np.asarray(axis / length, np.float64))
+        directions.append(np.asarray(axis / length, float))
         distances.append(radius / np.sqrt(1 - min(1 / length**2, 1 - 1e-12)))
     start = np.array([camera.centre for camera in cameras])
     if len(cameras) == 1:
@@ -290,8 +290,8 @@ def light_position(origins: ArrayLike, directions: ArrayLike) -> LightPosition:
     InputError
         Fewer than two rays, values that are not finite, or rays that are nearly parallel.
     """
-    start = np.asarray(origins, np.float64)
-    way = np.asarray(directions, np.float64)
+    start = np.asarray(origins, float)
+    way = np.asarray(directions, float)
     shaped = start.ndim == 2 and start.shape == way.shape and len(start) >= 2
     require(
         shaped and np.isfinite([start, way]).all(),
@@ -445,13 +445,13 @@ def _pixels(
         frames = checked_view(dome, light.id, view.merger, white=True)
         merged, flag = view.merger.merge(frames)
         usable = flag.ravel()[view.target.at] == OK
-        values = merged.reshape(-1, 3)[view.target.at].astype(np.float64)
+        values = merged.reshape(-1, 3)[view.target.at].astype(float)
         values[~usable] = np.nan
         radiance.append(values)
         points.append(view.target.points)
         if usable.any():
             scattered = merged[view.beside & (flag != SATURATED)]
-            total = np.nansum(scattered, dtype=np.float64) / 3
+            total = np.nansum(scattered, dtype=float) / 3
             beside.append(total / (float(np.nanmean(values)) * view.area))
     pixels = TargetPixels(
         np.concatenate(radiance),

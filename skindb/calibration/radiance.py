@@ -10,7 +10,6 @@ from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.calibration._merge_kernels import (
     DARK,
@@ -24,13 +23,13 @@ from skindb.errors import Fault, attempt
 from skindb.format.dome import CameraRecord, DomeRecord
 from skindb.format.frames import Digests, Frame, filled, read_frames
 from skindb.format.sensor import SensorRecord
-from skindb.types import Float64, Index
+from skindb.types import Bytes, Float32, Float64, Index, Mask
 
 # number of radiances up to the white level at which the linear model is fitted to the
 # variance
 RADIANCES = 64
 
-Image = NDArray[np.float32]
+Image = Float32
 
 
 @dataclass(frozen=True)
@@ -47,8 +46,8 @@ class FrameMerger:
         frames: list[Frame],
         spans: Index | None = None,
         *,
-        usable: NDArray[np.uint8] | None = None,
-    ) -> tuple[Image, NDArray[np.uint8]]:
+        usable: Bytes | None = None,
+    ) -> tuple[Image, Bytes]:
         """Radiance (h, w, 3) and flags (h, w) of the exposures of one view, by the
         compiled `merge_exposures`.
 
@@ -87,7 +86,7 @@ class FrameMerger:
         longest = max(self.seconds)
         shade = np.ones((1, 1))
         if self.vignette is not None:
-            shade = self.vignette[..., 0].astype(np.float64)
+            shade = self.vignette[..., 0].astype(float)
         colours = matrix if (matrix != np.eye(3)).any() else np.zeros((0, 3))
         return ExposureModel(
             dark=dark,
@@ -185,7 +184,7 @@ def merge_exposures(
     *,
     dark: Sequence[Frame] | Frame | None = None,
     vignette: Image | None = None,
-) -> tuple[Image, Image, NDArray[np.uint8]]:
+) -> tuple[Image, Image, Bytes]:
     """Merge several exposures to one radiance, each weighted by its inverse variance.
 
     The variance is that of the expected signal, not of the measured value, as weights
@@ -251,7 +250,7 @@ class _Exposure(NamedTuple):
 
     signal: Image  # (h, w, 3) relative exposure, 0 where it is not usable
     sigma: Image  # (h, w, 3) of the read noise
-    usable: NDArray[np.bool_]  # (h, w, 3)
+    usable: Mask  # (h, w, 3)
     seconds: np.float32
 
 
@@ -284,7 +283,7 @@ def radiance_floor(sensor: SensorRecord, exposures: Mapping[str, float]) -> floa
     return float(read_sigma(slope, sensor).mean() / time)
 
 
-def _linear(frames: list[Frame]) -> tuple[Image, Image, NDArray[np.uint8]]:
+def _linear(frames: list[Frame]) -> tuple[Image, Image, Bytes]:
     # a single one, as `read_dome` requires
     (frame,) = frames
     radiance = frame.astype(np.float32)
@@ -352,7 +351,7 @@ def radiance_noise(
         Gain of the lens (vignette) at the face.
     """
     sensor = camera.sensor
-    time = np.asarray(seconds, np.float64)
+    time = np.asarray(seconds, float)
     per_value = np.asarray([1 / (sensor.white - sensor.black)], np.float32)
     read = float(read_sigma(per_value, sensor)[0]) ** 2
     # an exposure is the longest usable one where all longer ones are saturated

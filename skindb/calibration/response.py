@@ -143,11 +143,11 @@ def recover_response(
     """
     options = options or ResponseOptions()
     frames = np.asarray(stack)
-    times = np.asarray(seconds, np.float64)
+    times = np.asarray(seconds, float)
     _require_stack(frames, times, (black, white), options.block)
     channels = [
         response_samples(
-            (frames[..., c].astype(np.float64) - black) / (white - black),
+            (frames[..., c].astype(float) - black) / (white - black),
             times,
             options,
         )
@@ -178,7 +178,7 @@ def recover_response(
         ),
         residual=np.array([residual for _, residual, _ in fits]),
         covered=np.array([[values.min(), values.max()] for values in usable]),
-        samples=np.array([count for _, _, count in fits], np.int64),
+        samples=np.array([count for _, _, count in fits], int),
         was_rising=np.array([(np.diff(curve) > 0).all() for curve in curves]),
     )
 
@@ -376,7 +376,7 @@ def _require_stack(
     elif min(frames.shape[1:3]) < block:
         rule = f"frames must be at least {block} px wide and high"
         faults.append(Fault(STACK, rule, str(frames.shape)))
-    elif not np.isfinite(frames.astype(np.float64)).all():
+    elif not np.isfinite(frames.astype(float)).all():
         rule = "its values must be finite"
         faults.append(Fault(STACK, rule, "NaN or infinity", "remove damaged frames"))
     if not (np.isfinite(times) & (times > 0)).all() or len(np.unique(times)) < 2:
@@ -439,7 +439,7 @@ def fit_noise(
         Wrong shape, values that are not finite, too few unsaturated pairs, or pairs of
         one brightness.
     """
-    frames = np.asarray(pairs, np.float64)
+    frames = np.asarray(pairs, float)
     shaped = frames.ndim == 4 and frames.shape[1] == 2 and frames[0, 0].size >= 100
     require(
         shaped and np.isfinite(frames).all(),
@@ -558,7 +558,7 @@ def average_dark(frames: ArrayLike) -> DarkFrame:
     InputError
         Fewer than two frames, another shape, or values that are not finite.
     """
-    values = np.asarray(frames).astype(np.float64)
+    values = np.asarray(frames).astype(float)
     shaped = values.ndim == 4 and values.shape[-1] == 3 and len(values) >= 2
     require(
         shaped and np.isfinite(values).all(),

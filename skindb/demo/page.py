@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import imagecodecs
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb import plots
 from skindb.analysis import plot_albedo, plot_basis_size, plot_translucency
@@ -33,6 +32,7 @@ from skindb.render.scene import (
 )
 from skindb.render.shading import View, shade_view, trace_view
 from skindb.schema import variables
+from skindb.types import Array, Bytes, Mask
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -41,9 +41,8 @@ if TYPE_CHECKING:
 
     from skindb.virtual.capture import Recovery
 
-Image = NDArray[np.floating[Any]]
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
+Image = Array
+Picture = Bytes
 ERRORS = (  # maps of residuals, black where they are unknown
     (variables.HELD_OUT_ERROR, 0.2, "error under lights the fit did not see"),
     (variables.OUTLIER_FRACTION, 0.1, "samples the model does not explain"),
@@ -79,7 +78,7 @@ class Table:
         return Table(self.name, header, self.rows)
 
 
-def picture(image: NDArray[np.uint8], alt: str, *, caption: str = "") -> str:
+def picture(image: Bytes, alt: str, *, caption: str = "") -> str:
     """An sRGB picture (rows, cols, 3) with an alternative text and, if there is one, a
     visible caption.
     """

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb import __version__
 from skindb.errors import Fault, InputError
@@ -39,7 +38,7 @@ from skindb.reflectance.tables import TableGrid, kernel_tables, lookup
 from skindb.render.image import write_exr
 from skindb.schema import VARIABLES, FitStatus, ProbeStatus, Use, names_of, variables
 from skindb.schema.consent import require_consent
-from skindb.types import Progress, silent
+from skindb.types import Float32, Float64, Progress, silent
 
 WIDTH = 100
 MERL = "Renderers that read MERL binaries"
@@ -312,7 +311,7 @@ def export_bundle(
     return target / "manifest.json"
 
 
-def merl_table(table: NDArray[np.float32]) -> NDArray[np.float64]:
+def merl_table(table: Float32) -> Float64:
     """One component (nh, nd, np) resampled to the bin centres of MERL, (90, 90, 180,
     3), with equal channels.
     """
@@ -320,7 +319,7 @@ def merl_table(table: NDArray[np.float32]) -> NDArray[np.float64]:
     d = (np.arange(90) + 0.5) / 90 * np.pi / 2
     p = (np.arange(180) + 0.5) / 180 * np.pi
     values = lookup(table[..., None], *np.meshgrid(h, d, p, indexing="ij"))
-    return np.repeat(np.asarray(values, np.float64), 3, axis=-1)
+    return np.repeat(np.asarray(values, float), 3, axis=-1)
 
 
 def _write_parts(

@@ -21,6 +21,7 @@ from skindb.optics.diffusion import (
     scattering_coefficients,
 )
 from skindb.schema import check, variables
+from skindb.types import Array
 
 REQUIRED = (
     variables.SURFEL_POSITION,
@@ -40,7 +41,7 @@ MIN_SIZE = 64
 MAX_SIZE = 8192
 # of memory while maps of 30 channels are computed (measured: 190)
 BYTES_PER_TEXEL = 220
-Float = NDArray[np.floating[Any]]
+Float = Array
 # mean free path of the walk over that of the dipole, s / sigma_tr, is this constant
 # plus this factor times R_d. Fitted to the edge of a shadow for R_d from 0.02 to 0.9
 # and an index of 1.3, within 3 %; within 20 % for an index of 1.45
@@ -54,7 +55,7 @@ def texture_size(model: xr.DataTree) -> int:
     """
     uv = model["fitted"].to_dataset()[variables.SURFEL_UV].values
     triangles = model["mesh"].to_dataset()[variables.TRIANGLE].values
-    corners = uv.astype(np.float64)[triangles]
+    corners = uv.astype(float)[triangles]
     edge = np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1))
     texels = TEXELS_PER_SPACING / max(float(edge), 1e-6)
     return int(np.clip(2 ** np.ceil(np.log2(texels)), MIN_SIZE, MAX_SIZE))
@@ -114,7 +115,7 @@ def required(model: xr.DataTree) -> xr.Dataset:
     corner = (
         fitted[variables.SURFEL_UV]
         .values[model["mesh"].to_dataset()[variables.TRIANGLE].values]
-        .astype(np.float64)
+        .astype(float)
     )
     if not np.isfinite(corner).all() or not np.ptp(corner, axis=1).any():
         rule = "texture coordinates must be finite and cover an area"
@@ -172,10 +173,7 @@ def mean_free_path(diffuse: Float, sigma_tr: Float, *, eta: float) -> Float:
     """
     s, _ = dipole_s(diffuse, eta=eta)
     return np.asarray(
-        (
-            MEAN_FREE_PATH_OFFSET
-            + MEAN_FREE_PATH_PER_ALBEDO * np.asarray(diffuse, np.float64)
-        )
+        (MEAN_FREE_PATH_OFFSET + MEAN_FREE_PATH_PER_ALBEDO * np.asarray(diffuse, float))
         * s
         / sigma_tr
     )

@@ -15,8 +15,9 @@ from skindb.geometry.atlas import atlas_values, push_pull, rasterise_atlas
 from skindb.reflectance.kinds import as_mixture, even_diffuse
 from skindb.render.surfels import surfel_confidence, surfel_texels, texel_codes
 from skindb.schema import VARIABLES, TexelStatus, variables
+from skindb.types import Array, Float32, Float64
 
-Image = NDArray[np.float32]
+Image = Float32
 MEASURED = {  # map: variable of the model; edited models have none of these
     "albedo_error": variables.DIFFUSE_REFLECTANCE_TOTAL_ERROR,
     "normal_error": variables.NORMAL_TOTAL_ERROR,
@@ -34,7 +35,7 @@ TRANSLUCENCY = {
     "the dipole with this sigma_tr",
 }
 STATUS = "; ".join(f"{int(code)} {code.explanation}" for code in TexelStatus)
-Float = NDArray[np.floating[Any]]
+Float = Array
 
 
 @dataclass(frozen=True)
@@ -58,8 +59,8 @@ class Atlas:
 
 def atlas_images(
     model: xr.DataTree,
-    columns: dict[str, NDArray[np.float32]],
-    trust: NDArray[np.float32],
+    columns: dict[str, Float32],
+    trust: Float32,
     *,
     size: int,
 ) -> tuple[Image, dict[str, int]]:
@@ -127,9 +128,7 @@ def texture_maps(
     )
 
 
-def _spread(
-    columns: NDArray[Any], trust: NDArray[np.float32], atlas: Atlas
-) -> tuple[Image, Image]:
+def _spread(columns: NDArray[Any], trust: Float32, atlas: Atlas) -> tuple[Image, Image]:
     """Texels (size, size, c), interpolated and filled in from the surroundings, and
     their confidence (size, size).
     """
@@ -155,7 +154,7 @@ def _columns(
         variables.SHADING_NORMAL: fitted[variables.SHADING_NORMAL].values,
         variables.BASIS_WEIGHT: fitted[variables.BASIS_WEIGHT].values,
     }
-    mesh = fitted[variables.SURFEL_NORMAL].values.astype(np.float64)
+    mesh = fitted[variables.SURFEL_NORMAL].values.astype(float)
     uv = fitted[variables.SURFEL_UV].values
     frames = tangent_frames(
         fitted[variables.SURFEL_POSITION].values, mesh, uv, triangles
@@ -172,7 +171,7 @@ def _columns(
 
 
 def _translucency(
-    fitted: xr.Dataset, trust: NDArray[np.float32], atlas: Atlas
+    fitted: xr.Dataset, trust: Float32, atlas: Atlas
 ) -> dict[str, TextureMap]:
     """Maps of the channels that are known at any trusted surfel, each filled
     separately; empty if there are none.
@@ -207,7 +206,7 @@ def _translucency(
 
 
 def _measured(
-    fitted: xr.Dataset, trust: NDArray[np.float32], atlas: Atlas
+    fitted: xr.Dataset, trust: Float32, atlas: Atlas
 ) -> dict[str, TextureMap]:
     """Maps of errors and of surface reflectance, if any trusted surfel has them.
 
@@ -233,7 +232,7 @@ def _measured(
 
 
 def _spread_known(
-    parts: dict[str, NDArray[Any]], trust: NDArray[np.float32], atlas: Atlas
+    parts: dict[str, NDArray[Any]], trust: Float32, atlas: Atlas
 ) -> dict[str, Image]:
     """Texels (size, size, c) by name of values (n, c), each from the trusted surfels
     where it is finite.
@@ -296,7 +295,7 @@ def _fitted_maps(image: Image, layout: dict[str, slice]) -> dict[str, TextureMap
 
 def tangent_frames(
     position: Float, normal: Float, uv: Float, triangles: NDArray[np.integer[Any]]
-) -> NDArray[np.float64]:
+) -> Float64:
     """Tangents (n, 4) of vertices: unit vectors in the direction of increasing u, and
     the sign of the bitangent.
 
@@ -311,8 +310,8 @@ def tangent_frames(
     triangles
         (f, 3) indices of vertices.
     """
-    corner = position[triangles].astype(np.float64)
-    place = uv[triangles].astype(np.float64)
+    corner = position[triangles].astype(float)
+    place = uv[triangles].astype(float)
     edge = corner[:, 1:] - corner[:, :1]
     step = place[:, 1:] - place[:, :1]
     area = step[:, 0, 0] * step[:, 1, 1] - step[:, 1, 0] * step[:, 0, 1]
@@ -343,9 +342,7 @@ def tangent_frames(
     return np.concatenate([tangent, sign[:, None]], axis=1)
 
 
-def to_tangent_space(
-    direction: Float, normal: Float, tangent: Float
-) -> NDArray[np.float64]:
+def to_tangent_space(direction: Float, normal: Float, tangent: Float) -> Float64:
     """Coordinates (n, 3) of directions along tangent, bitangent and normal, see
     `tangent_frames`.
     """
@@ -359,7 +356,7 @@ def to_tangent_space(
     )
 
 
-def _any_perpendicular(normal: Float) -> NDArray[np.float64]:
+def _any_perpendicular(normal: Float) -> Float64:
     axis = np.where(np.abs(normal[:, :1]) < 0.9, [[1.0, 0, 0]], [[0.0, 1, 0]])
     tangent = np.cross(normal, axis)
     return np.asarray(tangent / np.linalg.norm(tangent, axis=1, keepdims=True))

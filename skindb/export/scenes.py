@@ -8,17 +8,16 @@ from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from string import Template
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb import __version__
 from skindb.export.textures import Skin, shading_normals
 from skindb.files import make_private, private_file
 from skindb.schema import variables
+from skindb.types import Array, Float64
 
 STAGE = "face.usda"
 MATERIAL = "face.mtlx"
@@ -166,7 +165,7 @@ def _usda(
     place = fitted[variables.SURFEL_POSITION].values.astype(np.float32)
     triangles = mesh[variables.TRIANGLE].values
     # v increases upwards in USD
-    uv = fitted[variables.SURFEL_UV].values.astype(np.float64) * [1, -1] + [0, 1]
+    uv = fitted[variables.SURFEL_UV].values.astype(float) * [1, -1] + [0, 1]
     return _template("usd", STAGE).substitute(
         version=__version__,
         extent=_vectors(np.stack([place.min(axis=0), place.max(axis=0)])),
@@ -274,13 +273,13 @@ def _shader(name: str, kind: str, lines: list[str]) -> str:
     return f'            def Shader "{name}"\n            {{\n{body}\n            }}\n'
 
 
-def _vectors(values: NDArray[np.floating[Any]]) -> str:
+def _vectors(values: Array) -> str:
     tuples = (", ".join(f"{x:.7g}" for x in row) for row in values.tolist())
     return f"[{', '.join(f'({numbers})' for numbers in tuples)}]"
 
 
-def _normals(fitted: xr.Dataset) -> NDArray[np.float64]:
-    normal = fitted[variables.SURFEL_NORMAL].values.astype(np.float64)
+def _normals(fitted: xr.Dataset) -> Float64:
+    normal = fitted[variables.SURFEL_NORMAL].values.astype(float)
     return np.asarray(
         normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     )

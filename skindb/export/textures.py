@@ -22,8 +22,9 @@ from skindb.reflectance.tables import kernel_tables, lookup
 from skindb.render.image import encode_srgb
 from skindb.render.surfels import surfel_confidence
 from skindb.schema import variables
+from skindb.types import Array, Bytes, Float32, Float64, Index
 
-Float = NDArray[np.floating]
+Float = Array
 # values of perceptual roughness that are tried for each point
 ROUGHNESS = np.linspace(0.1, 1.0, 46)
 # of fitting lobe and base colour in turn; after the third, the error changes by less
@@ -63,7 +64,7 @@ class _Pairs:
 
 
 def fit_material(
-    tables: NDArray[np.float32], diffuse: Float, weights: Float, *, eta: float
+    tables: Float32, diffuse: Float, weights: Float, *, eta: float
 ) -> Material:
     """Fit the material whose pictures differ least from those of the model, separately
     at each point.
@@ -93,8 +94,8 @@ def fit_material(
     parts = np.concatenate([through[:, None], lookup(tables, *pairs.angles)], axis=1)
     amounts = np.stack(
         [np.concatenate([diffuse[:, [c]], weights], axis=1) for c in range(3)]
-    ).astype(np.float64)
-    base: Float = np.asarray(diffuse, np.float64)
+    ).astype(float)
+    base: Float = np.asarray(diffuse, float)
     low: Float
     high: Float
     roughness: Float
@@ -232,7 +233,7 @@ def _fit_base(
 
 
 def approximation_error(
-    tables: NDArray[np.float32],
+    tables: Float32,
     diffuse: Float,
     weights: Float,
     values: Material,
@@ -356,7 +357,7 @@ class Skin:
 
     # baseColor, metallicRoughness, specular, specularColor, normal, and
     # diffuseTransmission if parts are thin
-    pictures: dict[str, NDArray[np.uint8]]
+    pictures: dict[str, Bytes]
     shape: Shape
     top_f0: float  # reflectance at normal incidence for a white specularColor
     mean_f0: float  # mean over all points, weighted by their specular factor
@@ -433,7 +434,7 @@ def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
 
 
 def _errors(
-    tables: NDArray[np.float32],
+    tables: Float32,
     diffuse: NDArray[Any],
     weights: NDArray[Any],
     materials: tuple[Material, ...],
@@ -458,11 +459,11 @@ def _errors(
 class Shape:
     """Vertices of the mesh, one for each surfel."""
 
-    position: NDArray[np.float32]  # (n, 3) mm
-    normal: NDArray[np.float64]  # (n, 3) of the mesh
-    shading: NDArray[np.float64]  # (n, 3) as fitted
-    tangent: NDArray[np.float64]  # (n, 4)
-    uv: NDArray[np.float32]  # (n, 2)
+    position: Float32  # (n, 3) mm
+    normal: Float64  # (n, 3) of the mesh
+    shading: Float64  # (n, 3) as fitted
+    tangent: Float64  # (n, 4)
+    uv: Float32  # (n, 2)
     triangles: NDArray[Any]
 
 
@@ -477,9 +478,7 @@ def _shape(fitted: xr.Dataset, triangles: NDArray[Any]) -> Shape:
     return Shape(place.astype(np.float32), normal, shading, tangent, uv, triangles)
 
 
-def _through(
-    fitted: xr.Dataset, shape: Shape, surfels: NDArray[np.int64], eta: float
-) -> NDArray[np.float64]:
+def _through(fitted: xr.Dataset, shape: Shape, surfels: Index, eta: float) -> Float64:
     """Fraction of the diffuse light (n, 3) at the known surfels that comes through the
     skin from the other side.
     """
@@ -489,7 +488,7 @@ def _through(
         fitted[name].values[surfels]
         for name in (variables.DIFFUSE_REFLECTANCE, variables.SIGMA_TR)
     )
-    deep = thickness(shape.position.astype(np.float64), shape.normal, shape.triangles)[
+    deep = thickness(shape.position.astype(float), shape.normal, shape.triangles)[
         surfels
     ]
     return np.asarray(
@@ -499,14 +498,14 @@ def _through(
 
 def _columns(
     skin: Material,
-    surfels: NDArray[np.int64],
+    surfels: Index,
     shape: Shape,
     top: float,
-    through: NDArray[np.float64],
-) -> dict[str, NDArray[np.float32]]:
+    through: Float64,
+) -> dict[str, Float32]:
     """Values (n, c) of the textures at every surfel; 0 where nothing was fitted."""
 
-    def spread(values: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+    def spread(values: Array) -> Float32:
         out = np.zeros((len(shape.position), values.shape[1]), np.float32)
         out[surfels] = values
         return out
@@ -529,7 +528,7 @@ def _columns(
     return columns
 
 
-def _textures(values: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.uint8]]:
+def _textures(values: dict[str, Float32]) -> dict[str, Bytes]:
     """8-bit textures, by their name in the material."""
     full = np.full(values["roughness"].shape, 255, np.uint8)
     bent = values["bent"] / np.maximum(
@@ -553,16 +552,14 @@ def _textures(values: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.ui
     return pictures
 
 
-def _eight_bits(values: NDArray[Any]) -> NDArray[np.uint8]:
+def _eight_bits(values: NDArray[Any]) -> Bytes:
     return np.asarray(np.round(np.clip(values, 0, 1) * 255), np.uint8)
 
 
-def _normal_error(
-    picture: NDArray[np.uint8], shape: Shape, surfels: NDArray[np.int64]
-) -> float:
+def _normal_error(picture: Bytes, shape: Shape, surfels: Index) -> float:
     """Median angle [degree] between the shading normals and those of the texture at the surfels."""
     size = len(picture)
-    places = (shape.uv[surfels].astype(np.float64) * size - 0.5)[:, ::-1].T
+    places = (shape.uv[surfels].astype(float) * size - 0.5)[:, ::-1].T
     bent = np.stack(
         [
             ndimage.map_coordinates(
@@ -583,9 +580,9 @@ def _normal_error(
     return float(np.degrees(np.median(np.arccos(cosine))))
 
 
-def _unit(fitted: xr.Dataset, name: str) -> NDArray[np.float64]:
+def _unit(fitted: xr.Dataset, name: str) -> Float64:
     """Unit normals (n, 3) in a variable; those of the scan where they are unknown."""
-    normal = fitted[name].values.astype(np.float64)
+    normal = fitted[name].values.astype(float)
     normal = np.where(
         np.isfinite(normal).all(axis=1, keepdims=True),
         normal,
@@ -595,6 +592,6 @@ def _unit(fitted: xr.Dataset, name: str) -> NDArray[np.float64]:
     return np.where(length > 1e-6, normal / np.maximum(length, 1e-6), [0.0, 0.0, 1.0])
 
 
-def shading_normals(fitted: xr.Dataset) -> NDArray[np.float64]:
+def shading_normals(fitted: xr.Dataset) -> Float64:
     """Unit shading normals (n, 3) of the surfels; those of the scan where they are unknown."""
     return _unit(fitted, variables.SHADING_NORMAL)

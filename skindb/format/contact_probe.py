@@ -223,7 +223,7 @@ def _log(value: Any) -> Log | None:
             return None
         if not all(is_number(x) and abs(x) <= MAX_MAGNITUDE for x in pair):
             return None
-    log = np.array(value, np.float64)
+    log = np.array(value, float)
     return log if (np.diff(log[:, 0]) > 0).all() else None
 
 

@@ -71,7 +71,7 @@ class Pinhole:
     @property
     def centre(self) -> Float64:
         """Centre of projection (3,) in mm."""
-        return np.asarray(camera_centre(self.R, self.t), np.float64)
+        return np.asarray(camera_centre(self.R, self.t), float)
 
     def project(self, points: ArrayLike) -> Float64:
         """Pixels (..., 2) of points (..., 3) in mm; NaN behind the camera."""

@@ -210,7 +210,7 @@ class Fields:
         """Finite numbers of exactly this shape; `fallback` if they are faulty."""
         value = self.get(key, default)
         array = None if value is None else self._array(key, value, shape)
-        return np.full(shape, fallback, np.float64) if array is None else array
+        return np.full(shape, fallback, float) if array is None else array
 
     def _array(self, key: str, value: Any, *shapes: tuple[int, ...]) -> Float64 | None:
         if not any(_has_shape(value, shape) for shape in shapes):
@@ -218,7 +218,7 @@ class Fields:
             self.fault(key, f"must be {sizes} numbers", shown(value))
             return None
         try:
-            array = np.array(value, np.float64)
+            array = np.array(value, float)
         except OverflowError:  # integers of hundreds of digits
             array = np.full(shapes[0], np.inf)
         if (np.abs(array) <= MAX_MAGNITUDE).all():

@@ -569,4 +569,4 @@ def _vertices(fields: Fields, name: str, count: int) -> Index | None:
         rule = f"vertex numbers must be below {count}, the vertices of the scan"
         fields.fault(name, rule, f"{shown(min(numbers))} to {shown(max(numbers))}")
         return None
-    return np.unique(np.array(numbers, np.int64))
+    return np.unique(np.array(numbers, int))

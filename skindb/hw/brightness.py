@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.format.frames import is_linear, read_frame
@@ -19,6 +18,7 @@ from skindb.hw.capture_folder import Setup
 from skindb.hw.dome import Dome
 from skindb.hw.sequence import DARK, Schedule, plan_schedule, slowed_schedule
 from skindb.hw.session import capture_dome, require_complete, with_dark_frames
+from skindb.types import Float64
 
 THREADS = 2
 MIN_NEIGHBOURS = 3
@@ -73,7 +73,7 @@ class Levels:
         """Whether the frame was taken."""
         return (picture.camera, picture.step) in self._frames
 
-    def of(self, pictures: Sequence[Picture]) -> NDArray[np.float64]:
+    def of(self, pictures: Sequence[Picture]) -> Float64:
         """Levels above black or background; NaN if a frame is missing or cannot be decoded."""
         new = [
             picture
@@ -94,10 +94,10 @@ class Levels:
             return float("nan")
         return float(np.quantile(value, LIT_QUANTILE))
 
-    def _read(self, name: str, step: int) -> NDArray[np.float64]:
+    def _read(self, name: str, step: int) -> Float64:
         """Mean of the channels, 0 at black and 1 at white; OpenEXR files hold such values."""
         path = self._frames[name, step]
-        value = np.asarray(read_frame(path).mean(axis=-1, dtype=np.float64))
+        value = np.asarray(read_frame(path).mean(axis=-1, dtype=float))
         if is_linear(path):
             return value
         camera = self._cameras[name]
@@ -296,8 +296,8 @@ def _ratio(dome: Mapping[str, Any], exposure: str, reference: str) -> float:
     return _seconds(dome, exposure) / _seconds(dome, reference)
 
 
-def _unit(vector: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
-    direction = np.asarray(vector, np.float64)
+def _unit(vector: Sequence[float] | Float64) -> Float64:
+    direction = np.asarray(vector, float)
     return np.asarray(direction / max(float(np.linalg.norm(direction)), 1e-12))
 
 

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.clock import SYSTEM_CLOCK, Clock
 from skindb.errors import Fault, InputError, system_fault
 from skindb.format.frames import frame_size
+from skindb.types import Float64, Index
 
 FRAME_SUFFIXES = (".png", ".tif", ".tiff", ".exr")
 LOOK_SECONDS = 0.05  # interval at which the folders are polled
@@ -203,9 +203,7 @@ def match_frames(shots: Sequence[Shot], triggers: Sequence[float]) -> list[Path 
     return [shots[i].path if i >= 0 else None for i in best]
 
 
-def _contradicted(
-    times: NDArray[np.float64], due: NDArray[np.float64], reach: float
-) -> bool:
+def _contradicted(times: Float64, due: Float64, reach: float) -> bool:
     """Whether nearly all frames fit triggers precisely, but not in their order.
 
     This happens if a file is written again, or if the controller reports another trigger as lost.
@@ -220,9 +218,7 @@ def _contradicted(
     return bool(matched.sum() >= MIN_PRECISE_FRACTION * len(due) and moved.any())
 
 
-def _assignment(
-    times: NDArray[np.float64], due: NDArray[np.float64], reach: float
-) -> NDArray[np.int64] | None:
+def _assignment(times: Float64, due: Float64, reach: float) -> Index | None:
     """Index of the frame of every due time, -1 if there is none; None if two offsets of
     the clocks fit equally well.
     """
@@ -235,7 +231,7 @@ def _assignment(
         matched = index >= 0
         error[k] = np.abs(times[index[matched]] - offset - due[matched]).sum()
     order = np.lexsort((error, -count))
-    best: NDArray[np.int64] = fits[order[0]]
+    best: Index = fits[order[0]]
     limit = 2 * error[order[0]] + AMBIGUOUS * reach * len(times)
     for candidate in order[1:]:
         rivals = count[candidate] == count[order[0]] and error[candidate] <= limit
@@ -244,9 +240,7 @@ def _assignment(
     return best
 
 
-def _nearest(
-    times: NDArray[np.float64], due: NDArray[np.float64], reach: float
-) -> NDArray[np.int64]:
+def _nearest(times: Float64, due: Float64, reach: float) -> Index:
     """Index of the frame nearest to each due time within reach, -1 if there is none."""
     right = np.clip(np.searchsorted(times, due), 1, max(len(times) - 1, 1))
     before = right - 1

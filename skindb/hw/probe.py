@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.hw.link import (
@@ -23,6 +22,7 @@ from skindb.hw.link import (
     Link,
     stopped_at_end,
 )
+from skindb.types import Float64
 
 KIND = "probe"
 # of the gauge: the probe adheres to the skin without leaving a mark
@@ -43,7 +43,7 @@ PAPER_BRACKETS = 23
 PAPER_RATIO = 2 ** (2 / 3)
 PAPER_SECONDS = 88.0  # for all exposures of a site
 
-Log = NDArray[np.float64]
+Log = Float64
 Reading = tuple[float, float]  # s since the pump was switched on, kPa
 
 

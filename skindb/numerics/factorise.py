@@ -10,7 +10,6 @@ from dataclasses import dataclass, fields
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from sklearn.decomposition import NMF
 from sklearn.exceptions import ConvergenceWarning
 
@@ -113,7 +112,7 @@ def _in_coefficients(X: Array, k: int, seed: int | None) -> tuple[Array, Array]:
     init = "nndsvda" if seed is None else "random"
     model = NMF(k, init=init, max_iter=MAX_SWEEPS, random_state=seed or 0)
     W = model.fit_transform(scaled)
-    return W.astype(np.float64) * level, model.components_.astype(np.float64)
+    return W.astype(float) * level, model.components_.astype(float)
 
 
 def _in_metric(X: Array, W: Array, H: Array, A: Array) -> Array:
@@ -279,7 +278,7 @@ class Components:
     residual: Array  # (n,) root mean square of the residual of each vector
 
 
-def principal_axes(vectors: NDArray[np.floating], max_components: int) -> Components:
+def principal_axes(vectors: Array, max_components: int) -> Components:
     """Principal components of vectors (n, d), n at least 2, from the eigenvectors of
     their inner products.
 
@@ -299,7 +298,7 @@ def principal_axes(vectors: NDArray[np.floating], max_components: int) -> Compon
     mean = np.empty(d)
     inner = np.zeros((n, n))
     for block in blocks:
-        x = vectors[:, block].astype(np.float64)
+        x = vectors[:, block].astype(float)
         mean[block] = x.mean(axis=0)
         x -= mean[block]
         inner += x @ x.T

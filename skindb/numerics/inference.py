@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from skindb.numerics.statistics import CONFIDENCE, ROUNDING
-from skindb.types import Array, Mask, float64
+from skindb.types import Array, Index, Mask, float64
 
-Index = NDArray[np.intp]
 Draw = NDArray[Any]  # an order, signs or labels of the subjects, or many of them
 SUMS = 2  # entries per draw and quantity when products of matrices are used
 MANY = 1000  # number of quantities from which products of matrices are faster
@@ -518,7 +517,7 @@ def _between(values: Array, group: Index, sizes: Index) -> Array:
     means = []
     errors = []
     for g, size in enumerate(sizes.tolist()):
-        member = (group == g).astype(np.float64)
+        member = (group == g).astype(float)
         mean = member @ values / size
         scatter = member @ square - size * (mean**2).sum(axis=1)
         scatter = np.maximum(scatter, 0.0) / (size - 1)

@@ -34,16 +34,16 @@ def solve_nnls(
     """
     # C order: a broadcast array would be copied in the order of its strides, for which
     # the kernel is compiled again
-    G = np.array(gram, np.float64, order="C")
-    b = np.array(rhs, np.float64, order="C")
+    G = np.array(gram, float, order="C")
+    b = np.array(rhs, float, order="C")
     x = (
         np.zeros_like(b)
         if warm is None
-        else np.maximum(np.array(warm, np.float64, order="C"), 0.0)
+        else np.maximum(np.array(warm, float, order="C"), 0.0)
     )
     kkt = np.full(len(b), np.nan)
     count = np.zeros(len(b), np.int32)
-    met = np.zeros(len(b), np.bool_)
+    met = np.zeros(len(b), bool)
     valid = np.isfinite(G).all(axis=(1, 2)) & np.isfinite(b + x).all(axis=1)
     finite = np.asarray(valid)
     _nnls_kernels.solve_many(G, b, x, finite, tolerance, kkt, count, met)

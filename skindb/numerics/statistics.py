@@ -58,7 +58,7 @@ class Moments:
         """Moments over the first axis; NaN counts as missing."""
         values = float64(values)
         finite = np.isfinite(values)
-        count = finite.sum(axis=0).astype(np.float64)
+        count = finite.sum(axis=0).astype(float)
         mean = np.where(finite, values, 0.0).sum(axis=0) / np.maximum(count, 1.0)
         second = (np.where(finite, values - mean, 0.0) ** 2).sum(axis=0)
         return cls(count, mean, second)

@@ -26,9 +26,9 @@ from scipy.fft import fftfreq, irfft2, rfft2, rfftfreq
 from scipy.ndimage import uniform_filter
 from scipy.optimize import isotonic_regression
 
-from skindb.types import Float64, Mask, float64
+from skindb.types import Array, Float64, Mask, float64
 
-Image = NDArray[np.floating[Any]]
+Image = Array
 Spectrum = NDArray[np.complexfloating[Any, Any]]
 LEVELS = 7
 ORIENTATIONS = 4
@@ -91,7 +91,7 @@ def build(
         If the image is not two-dimensional and finite, or too small for this number of levels.
     """
     image = np.asarray(image)
-    image = image if image.dtype == np.float32 else image.astype(np.float64)
+    image = image if image.dtype == np.float32 else image.astype(float)
     if image.ndim != 2 or not image.size or not np.isfinite(image).all():
         raise ValueError(
             f"an image must have two dimensions and finite values, not the shape {image.shape}"
@@ -321,7 +321,7 @@ def part_histogram(part: Image, fraction: Image, edges: Float64) -> Float64:
     bins = len(edges) - 1
     if not inside.size:
         return np.full(bins, np.nan)
-    place = ((inside - edges[0]) * (bins / (edges[-1] - edges[0]))).astype(np.int64)
+    place = ((inside - edges[0]) * (bins / (edges[-1] - edges[0]))).astype(int)
     return np.bincount(np.clip(place, 0, bins - 1), minlength=bins) / inside.size
 
 
@@ -333,7 +333,7 @@ def valid_quantiles(values: Float64) -> Float64:
     histogram of the same mass, and its mean is that of `values`. NaN stays NaN.
     """
     flat = values.reshape(-1, values.shape[-1])
-    out = np.array(flat, np.float64)
+    out = np.array(flat, float)
     decreasing = (np.diff(flat, axis=1) < 0).any(axis=1)
     for i in np.flatnonzero(np.isfinite(flat).all(axis=1) & decreasing):
         out[i] = isotonic_regression(flat[i]).x
@@ -430,7 +430,7 @@ class _Matching:
             counted = [level_fractions(mask, shapes) for mask in measured]
         sources = np.stack([part_quantiles(parts, masks) for masks in counted])
         sums = np.where(np.isfinite(shifts), sources + shifts, sources)
-        size = np.array([part.size for part in parts], np.float64)
+        size = np.array([part.size for part in parts], float)
         return cls(blend, total, counted, valid_quantiles(sums), size)
 
     def quantiles(self, part: Image, k: int) -> Float64:

@@ -7,7 +7,6 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.optics._tree_kernels import (
     LIGHTS_IN_REGISTERS,
@@ -19,7 +18,7 @@ from skindb.optics._tree_kernels import (
 )
 from skindb.optics.diffusion import S_FLOOR, diffuse_reflectance, reduced_albedo
 from skindb.optics.fresnel import boundary_factor
-from skindb.types import Array, Float64, Index, Mask, float64
+from skindb.types import Array, Float32, Float64, Index, Mask, float64
 
 MAX_LEAF_POINTS = 8  # nodes with more points are divided
 # mean paths 1 / sigma_tr after which the profile is below 1e-7 of its integral
@@ -40,7 +39,7 @@ def subsurface_exitance(
     tolerance: float = 0.1,
     normalise: bool = True,
     receivers: Mask | None = None,
-) -> NDArray[np.float32]:
+) -> Float32:
     """Radiant exitance under the boundary at every point, for many lights in one
     traversal of the tree.
 
@@ -132,7 +131,7 @@ def _gather_parallel(
     return even, sums
 
 
-def _powers(power: Array, tree: Tree) -> NDArray[np.float32]:
+def _powers(power: Array, tree: Tree) -> Float32:
     """Power (groups, points and nodes, LIGHTS_IN_REGISTERS) [irradiance mm2] from the
     power (n, l) of points.
 
@@ -152,8 +151,8 @@ def _morton(points: Array) -> Index:
     """Morton codes of ten bits per axis."""
     low = points.min(axis=0)
     span = max(float(np.ptp(points, axis=0).max()), 1e-12)
-    cell = np.minimum((points - low) / span * 1024, 1023).astype(np.int64)
-    code = np.zeros(len(points), np.int64)
+    cell = np.minimum((points - low) / span * 1024, 1023).astype(int)
+    code = np.zeros(len(points), int)
     for bit in range(10):
         for axis in range(3):
             code |= ((cell[:, axis] >> bit) & 1) << (3 * bit + 2 - axis)

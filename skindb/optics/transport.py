@@ -45,7 +45,7 @@ from scipy.special import gammaln, k0e, lpmv
 from skindb.cache import cached_arrays
 from skindb.optics._walk_kernels import walk
 from skindb.optics.fresnel import fresnel_reflectance
-from skindb.types import Array, Index, Mask, float64
+from skindb.types import Array, Bytes, Float32, Index, Mask, float64
 
 ANISOTROPY = 0.8  # of skin; for a given sigma_s' the profile hardly depends on it
 DEGREE = 11
@@ -208,7 +208,7 @@ def moment_basis(degree: int, *, eta: float, anisotropy: float) -> MomentBasis:
     minus = (h.T * (weight * (1 - back))) @ h * same
     flux = np.sqrt(2 * np.pi) * h.T @ (weight * inside * (1 - back))
     return MomentBasis(
-        order=degrees.astype(np.float64),
+        order=degrees.astype(float),
         even=even,
         source=np.where(m == 0, np.sqrt((2 * degrees + 1) / (4 * np.pi)), 0.0),
         along=(y.T * (w * x)) @ y * same,
@@ -303,10 +303,10 @@ def half_space_profile(
 class Walk:
     """Escapes of photons in a walk without absorption; lengths in units of 1/sigma_s'."""
 
-    radius: NDArray[np.float32]  # (m,) distance between entry and escape
-    path: NDArray[np.float32]  # (m,) length of the path before the escape
-    weight: NDArray[np.float32]  # (m,) fraction of the packet that escapes
-    batch: NDArray[np.uint8]  # (m,) index of the independent batch of packets
+    radius: Float32  # (m,) distance between entry and escape
+    path: Float32  # (m,) length of the path before the escape
+    weight: Float32  # (m,) fraction of the packet that escapes
+    batch: Bytes  # (m,) index of the independent batch of packets
     packets: int
     max_path: float  # length of the path after which packets are discarded
 
@@ -343,7 +343,7 @@ def random_walk(
     """
     per_batch = max(packets // BATCHES, 1)
 
-    def run(stream: np.random.Generator) -> NDArray[np.float32]:
+    def run(stream: np.random.Generator) -> Float32:
         events = np.empty((per_batch * EVENTS_PER_PACKET + 64, 3), np.float32)
         count = walk(stream, per_batch, anisotropy, eta, max_path, events)
         if count == len(events):
@@ -379,7 +379,7 @@ def radial_profile(
     ring = np.searchsorted(edges, escapes.radius / sigma_s_prime, side="right") - 1
     count = len(edges) - 1
     inside = (ring >= 0) & (ring < count)
-    index = escapes.batch[inside].astype(np.int64) * count + ring[inside]
+    index = escapes.batch[inside].astype(int) * count + ring[inside]
     energy = np.bincount(index, escaped[inside], BATCHES * count)
     area = np.pi * np.diff(edges**2)
     density = energy.reshape(BATCHES, count) * (BATCHES / escapes.packets) / area
@@ -388,4 +388,4 @@ def radial_profile(
 
 def _escaped_weight(escapes: Walk, ratio: float) -> Array:
     """Weights of the escapes with the absorption sigma_a / sigma_s'."""
-    return np.asarray(escapes.weight * np.exp(-ratio * escapes.path.astype(np.float64)))
+    return np.asarray(escapes.weight * np.exp(-ratio * escapes.path.astype(float)))

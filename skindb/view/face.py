@@ -28,8 +28,9 @@ from skindb.render.surfels import surfel_confidence
 from skindb.schema import variables
 from skindb.schema.consent import honour_consent
 from skindb.schema.notes import Omission
+from skindb.types import Array, Float32
 
-Float = NDArray[np.floating[Any]]
+Float = Array
 COUNT = 256  # lights, in 64 passes of four
 SKY_ROWS = 32  # rows of the image of the default sky
 GROUND = 0.2  # radiance below the horizon, relative to that of the zenith
@@ -292,7 +293,7 @@ def diffusion_width(s: Float, eta: float) -> Float:
     eta
         Relative index of refraction.
     """
-    depth = np.maximum(np.asarray(s, np.float64), S_FLOOR)  # z_r sigma_tr
+    depth = np.maximum(np.asarray(s, float), S_FLOOR)  # z_r sigma_tr
     above = depth * (1 + 4 / 3 * boundary_factor(eta))
     # one source at depth z: the integral of R is exp(-z) / 2, that of r^2 R is z
     # exp(-z), in units of 1 / sigma_tr
@@ -305,7 +306,7 @@ def uv_spacing(vertices: Float, faces: NDArray[np.integer[Any]], uv: Float) -> F
     """Length (n,) [mm] of one unit of the texture coordinates at each vertex."""
     flat = np.concatenate([uv, np.zeros((len(uv), 1))], axis=1)
     square = vertex_areas(vertices, faces) / np.maximum(
-        vertex_areas(flat.astype(np.float64), faces), 1e-12
+        vertex_areas(flat.astype(float), faces), 1e-12
     )
     return np.asarray(np.sqrt(np.clip(square, 1e-6, 1e12)))
 
@@ -319,7 +320,7 @@ def _values(surface: Surface, mixed: Float) -> dict[str, Float]:
     diffusion = np.zeros((len(surface.vertices), 3))
     if surface.sigma_tr is not None:
         diffusion = np.nan_to_num(
-            1 / np.asarray(surface.sigma_tr, np.float64), nan=0.0, posinf=0.0
+            1 / np.asarray(surface.sigma_tr, float), nan=0.0, posinf=0.0
         )
     return {
         "albedo": np.maximum(surface.diffuse, MIN_ALBEDO),
@@ -357,7 +358,7 @@ def _trait(trait: Trait, plain: Mapping[str, Float]) -> dict[str, Any]:
     }
 
 
-def _tables(tables: NDArray[np.float32]) -> list[NDArray[np.float16]]:
+def _tables(tables: Float32) -> list[NDArray[np.float16]]:
     """Tables (nh, nd, np, k) as arrays (np, nh, nd, 4), one for every four bases."""
     count = tables.shape[-1]
     padded = np.zeros(

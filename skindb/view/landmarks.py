@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.format.fields import read_json
@@ -34,9 +33,10 @@ from skindb.geometry.landmarks import MEAN_FACE, suggest_landmarks
 from skindb.geometry.mesh import closest_on_mesh, vertex_normals
 from skindb.geometry.scan import Crop, Scan, read_colours, read_scan
 from skindb.limits import MAX_JSON_BYTES
+from skindb.types import Bytes, Float64
 from skindb.view.page import HTML, Content, PageServer, embedded_json, page_text
 
-Points = Mapping[str, NDArray[np.float64]]
+Points = Mapping[str, Float64]
 # clicks are on the surface; single precision and rounding cause errors of 0.001
 MAX_OFF_SURFACE_MM = 1.0
 DECIMALS = 3  # of coordinates [mm] in the file
@@ -74,7 +74,7 @@ class LandmarkTask:
     out: Path  # landmarks.json
     scan: Scan
     surface: CleanMesh  # the part of the scan that ingest keeps
-    colours: NDArray[np.uint8] | None  # (v, 3), sRGB
+    colours: Bytes | None  # (v, 3), sRGB
     points: Points  # landmarks in the file [mm]
     crop: Crop | None
 
@@ -126,7 +126,7 @@ def _existing(path: Path) -> Any:
     return stored
 
 
-def parsed_points(value: Any, file: str) -> dict[str, NDArray[np.float64]]:
+def parsed_points(value: Any, file: str) -> dict[str, Float64]:
     """Positions (3,) [mm] by name from JSON.
 
     Raises
@@ -152,7 +152,7 @@ def parsed_points(value: Any, file: str) -> dict[str, NDArray[np.float64]]:
     ]
     if wrong:
         raise InputError(wrong)
-    return {name: np.array(p, np.float64) for name, p in value.items()}
+    return {name: np.array(p, float) for name, p in value.items()}
 
 
 def landmark_mistakes(

@@ -32,7 +32,7 @@ from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.tables import directional_albedo
 from skindb.render.scene import Surface
 from skindb.schema import FitStatus, variables
-from skindb.types import Progress
+from skindb.types import Array, Float64, Mask, Progress
 from skindb.virtual.dome import (
     CENTRE,
     DARK,
@@ -59,7 +59,6 @@ from skindb.virtual.person import Person, default_people, face_shape
 from skindb.virtual.probe import ProbeTruth, write_probe
 from skindb.virtual.skin import MATERIALS, Skin, skin_of, smooth_noise
 
-Array = NDArray[np.floating]
 # mm along the normal of the scan within which the true surface is searched
 SEARCH = 5.0
 # mm
@@ -300,7 +299,7 @@ def _require_empty(out: Path) -> None:
 
 
 @cache
-def _materials() -> tuple[Dictionary, NDArray[np.float64]]:
+def _materials() -> tuple[Dictionary, Float64]:
     """Materials of the true surface for the dome's lights, and their directional albedo
     at normal incidence.
     """
@@ -480,7 +479,7 @@ class Recovery:
     normal_angle: Array  # (surfel,) degrees
     diffuse_error: Array  # (surfel, channel) relative
     true_diffuse: Array  # (surfel, channel)
-    fitted: NDArray[np.bool_]  # (surfel,)
+    fitted: Mask  # (surfel,)
     sigma_tr_error: Mapping[str, Array]  # site -> (channel,) relative, signed
 
     def summary(self) -> dict[str, object]:
@@ -545,17 +544,17 @@ def foot_points(
     where there is none, and barycentric coordinates (n, 3).
     """
     position, normal = (
-        fitted[name].values.astype(np.float64)
+        fitted[name].values.astype(float)
         for name in (variables.SURFEL_POSITION, variables.SURFEL_NORMAL)
     )
-    scene = RayScene(truth["vertices"], truth["faces"].astype(np.int64))
+    scene = RayScene(truth["vertices"], truth["faces"].astype(int))
     face, corner, distance = scene.first_hit(position + SEARCH * normal, -normal)
     return np.where(distance <= 2 * SEARCH, face, -1), corner
 
 
 def at_foot_points(values: Array, corner: Array) -> Array:
     """Values (n, 3, c) of the corners, interpolated (n, c)."""
-    return np.asarray(np.einsum("nkc,nk->nc", values.astype(np.float64), corner))
+    return np.asarray(np.einsum("nkc,nk->nc", values.astype(float), corner))
 
 
 def _sites(model: xr.DataTree, truth: Mapping[str, Array]) -> dict[str, Array]:

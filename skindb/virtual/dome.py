@@ -21,8 +21,8 @@ from skindb.geometry.rays import RayScene
 from skindb.parameters import require_sizes
 from skindb.render.scene import Camera, Lights, Surface
 from skindb.render.shading import exitances, polariser_factor, shade_view, trace_view
+from skindb.types import Float32, Float64
 
-Array = NDArray[np.float64]
 CENTRE = np.array([0.0, -8.0, 45.0])  # of the dome in the subject frame, mm
 # mm
 LIGHT_RADIUS = 880.0
@@ -35,7 +35,7 @@ DEGREES = {None: 0.0, "left": 2 * LEAK - 1, "right": 1 - 2 * LEAK}
 HEAD = np.array([96.0, 138.0, 92.0])
 EXPOSURES = ("e0", "e1")  # of every view
 FRONT = 78.0  # degrees: lights farther from the front would not reach the white target
-Image = NDArray[np.float32]
+Image = Float32
 SECONDS = (0.040, 0.005)
 FRAMES = "dome/frames/{exposure}/{light}_{camera}.png"
 DARK = "dome/dark/{exposure}_{camera}.png"
@@ -53,11 +53,11 @@ class DomeCamera:
     name: str
     width: int
     height: int
-    matrix: Array  # (3, 3) pixel
-    rotation: Array  # (3, 3)
-    translation: Array  # (3,) mm
-    distortion: Array  # (5,) k1 k2 p1 p2 k3
-    vignette: Array  # (3,) a2 a4 a6
+    matrix: Float64  # (3, 3) pixel
+    rotation: Float64  # (3, 3)
+    translation: Float64  # (3,) mm
+    distortion: Float64  # (5,) k1 k2 p1 p2 k3
+    vignette: Float64  # (3,) a2 a4 a6
     polariser: str | None = None  # "left" or "right", circular
 
     @property
@@ -66,7 +66,7 @@ class DomeCamera:
         return DEGREES[self.polariser]
 
     @property
-    def position(self) -> Array:
+    def position(self) -> Float64:
         """Centre of projection (3,) mm."""
         return np.asarray(-self.rotation.T @ self.translation)
 
@@ -76,9 +76,9 @@ class DomeLight:
     """A disc light that faces the centre, with equal intensity in all directions."""
 
     name: str
-    position: Array  # (3,) mm
-    axis: Array  # (3,) unit, the direction it shines along
-    intensity: Array  # (3,) radiance mm2
+    position: Float64  # (3,) mm
+    axis: Float64  # (3,) unit, the direction it shines along
+    intensity: Float64  # (3,) radiance mm2
     disc_radius: float = DISC_RADIUS
     polariser: str | None = None
 
@@ -147,7 +147,7 @@ def build_dome(
     )
 
 
-def _spiral(count: int, reach: float, *, turn: float) -> Array:
+def _spiral(count: int, reach: float, *, turn: float) -> Float64:
     """`count` unit directions spread evenly over the cap within `reach` of +z
     (golden-angle spiral).
     """
@@ -158,7 +158,7 @@ def _spiral(count: int, reach: float, *, turn: float) -> Array:
     return np.stack([sine * np.cos(angle), sine * np.sin(angle), cosine], axis=1)
 
 
-def _apart(eyes: Array, lamps: Array) -> Array:
+def _apart(eyes: Float64, lamps: Float64) -> Float64:
     """Rotate cameras about +z if a light obstructs their view (a light's disc is 1.6
     degrees wide).
     """
@@ -178,7 +178,7 @@ def _apart(eyes: Array, lamps: Array) -> Array:
     return out
 
 
-def _light(index: int, direction: Array, rng: np.random.Generator) -> DomeLight:
+def _light(index: int, direction: Float64, rng: np.random.Generator) -> DomeLight:
     position = (
         CENTRE + direction * (LIGHT_RADIUS + rng.normal(0, 3)) + rng.normal(0, 1.5, 3)
     )
@@ -190,7 +190,7 @@ def _light(index: int, direction: Array, rng: np.random.Generator) -> DomeLight:
 
 
 def _camera(
-    index: int, direction: Array, width: int, height: int, rng: np.random.Generator
+    index: int, direction: Float64, width: int, height: int, rng: np.random.Generator
 ) -> DomeCamera:
     eye = CENTRE + direction * (CAMERA_RADIUS + rng.normal(0, 5))
     rotation = _look_at(
@@ -220,7 +220,7 @@ def _camera(
     )
 
 
-def _look_at(eye: Array, target: Array, roll: float) -> Array:
+def _look_at(eye: Float64, target: Float64, roll: float) -> Float64:
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, [0.0, 1.0, 0.0])
     right /= np.linalg.norm(right)

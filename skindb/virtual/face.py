@@ -7,9 +7,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from skindb.types import Float64
+
 STEP = 0.02  # mm, of the central differences that give the normal
 REGIONS = (
     "forehead",
@@ -50,7 +50,7 @@ class FaceShape:
     asymmetry: float = 0.0  # mm, sideways bend of the midline
 
     @property
-    def nose_tip(self) -> Array:
+    def nose_tip(self) -> Float64:
         """Centre of the tip's ball."""
         return np.array([0.0, 7.0 - self.nose_length, 113.0 + self.nose_height])
 
@@ -60,7 +60,7 @@ class FaceShape:
         return -33.5 - 0.4 * self.nose_length
 
 
-def field(points: Array, shape: FaceShape) -> Array:
+def field(points: Float64, shape: FaceShape) -> Float64:
     """Approximate signed distance (n,) mm of `points` (n, 3) to the skin, negative
     inside; smooth near the skin.
     """
@@ -77,7 +77,7 @@ def field(points: Array, shape: FaceShape) -> Array:
     return _mouth(q, distance, shape)
 
 
-def normals(points: Array, shape: FaceShape) -> Array:
+def normals(points: Float64, shape: FaceShape) -> Float64:
     """Unit outward normals (n, 3) at points on the skin: the field's gradient."""
     step = STEP * np.eye(3)
     slope = np.stack(
@@ -87,8 +87,8 @@ def normals(points: Array, shape: FaceShape) -> Array:
 
 
 def _ellipsoid(
-    p: Array, centre: tuple[float, ...] | Array, radii: tuple[float, ...]
-) -> Array:
+    p: Float64, centre: tuple[float, ...] | Float64, radii: tuple[float, ...]
+) -> Float64:
     x, y, z = ((p[i] - centre[i]) / radii[i] for i in range(3))
     length = np.sqrt(x * x + y * y + z * z + 1e-9)
     x = x / radii[0]
@@ -98,12 +98,12 @@ def _ellipsoid(
 
 
 def _cone(
-    p: Array,
-    a: tuple[float, ...] | Array,
-    b: tuple[float, ...] | Array,
+    p: Float64,
+    a: tuple[float, ...] | Float64,
+    b: tuple[float, ...] | Float64,
     ra: float,
     rb: float,
-) -> Array:
+) -> Float64:
     """Round cone: a capsule from `a` to `b` whose radius runs from ra to rb."""
     axis = np.asarray(b, float) - np.asarray(a, float)
     x, y, z = (p[i] - a[i] for i in range(3))
@@ -115,30 +115,30 @@ def _cone(
     return np.asarray(np.sqrt(x * x + y * y + z * z) - ra - along * (rb - ra))
 
 
-def _join(a: Array, b: Array, blend: float) -> Array:
+def _join(a: Float64, b: Float64, blend: float) -> Float64:
     """Smooth union: cubic polynomial minimum, twice differentiable."""
     h = np.maximum(blend - np.abs(a - b), 0) / blend
     return np.asarray(np.minimum(a, b) - h**3 * blend / 6)
 
 
-def _carve(a: Array, b: Array, blend: float) -> Array:
+def _carve(a: Float64, b: Float64, blend: float) -> Float64:
     """Smooth difference: `a` without `b`."""
     return -_join(-a, b, blend)
 
 
 def _press(
-    p: Array,
-    distance: Array,
+    p: Float64,
+    distance: Float64,
     centre: tuple[float, ...],
     width: tuple[float, ...],
     depth: float,
-) -> Array:
+) -> Float64:
     """Push the skin in by `depth` under a Gaussian (a negative depth lifts it)."""
     x, y, z = ((p[i] - centre[i]) / width[i] for i in range(3))
     return np.asarray(distance + depth * np.exp(-0.5 * (x * x + y * y + z * z)))
 
 
-def _skull(p: Array, s: FaceShape) -> Array:
+def _skull(p: Float64, s: FaceShape) -> Float64:
     d = _ellipsoid(p, (0, 50, 4), (76, 100, 93))
     d = _join(d, _ellipsoid(p, (0, 84, 42), (58, 44, 50)), 40)
     d = _join(d, _ellipsoid(p, (0, -8, 22), (65, 92, 78)), 40)
@@ -151,7 +151,7 @@ def _skull(p: Array, s: FaceShape) -> Array:
     return _join(d, neck, 24)
 
 
-def _middle(p: Array, d: Array, s: FaceShape) -> Array:
+def _middle(p: Float64, d: Float64, s: FaceShape) -> Float64:
     d = _join(d, _ellipsoid(p, (0, -29, 74), (35, 34, 34.5)), 26)  # around the teeth
     d = _join(d, _ellipsoid(p, (44, 10, 62), (20, 17, 22 + 4 * s.cheekbone)), 34)
     d = _join(
@@ -173,7 +173,7 @@ def _middle(p: Array, d: Array, s: FaceShape) -> Array:
     return _carve(d, fold + 4.0 - 3.0 * s.sagging, 7)
 
 
-def _eyes(p: Array, d: Array, s: FaceShape) -> Array:
+def _eyes(p: Float64, d: Float64, s: FaceShape) -> Float64:
     ridge = _cone(p, (6, 54, 88 + 3 * s.brow), (40, 58, 74 + 2 * s.brow), 10, 8)
     d = _join(d, ridge, 30)
     x = s.eye_distance
@@ -198,12 +198,12 @@ def _eyes(p: Array, d: Array, s: FaceShape) -> Array:
     return _press(p, d, (x - 3, 18, 92), (11, 3.5, 14), 1.6 * s.sagging)
 
 
-def lid_height(x: Array, s: FaceShape) -> Array:
+def lid_height(x: Float64, s: FaceShape) -> Float64:
     """Height of the closed lids' line at |x|."""
     return np.asarray(29.0 + 0.012 * (x - s.eye_distance) ** 2)
 
 
-def _nose(p: Array, d: Array, s: FaceShape) -> Array:
+def _nose(p: Float64, d: Float64, s: FaceShape) -> Float64:
     tip = s.nose_tip
     bridge = _cone(
         p, (0, 44, 91 - s.bridge_depth), tip + np.array([0.0, 4.0, -3.0]), 8.0, 9.5
@@ -228,7 +228,7 @@ def _nose(p: Array, d: Array, s: FaceShape) -> Array:
     )
 
 
-def _mouth(p: Array, d: Array, s: FaceShape) -> Array:
+def _mouth(p: Float64, d: Float64, s: FaceShape) -> Float64:
     y = s.mouth_height
     w = s.mouth_width
     full = s.lip_fullness
@@ -250,7 +250,7 @@ def _mouth(p: Array, d: Array, s: FaceShape) -> Array:
     return _press(p, d, (0, y + 14, 110), (3.0, 6, 10), 1.3)  # philtrum
 
 
-def mouth_line(x: Array) -> Array:
+def mouth_line(x: Float64) -> Float64:
     """Height of the line between the lips at |x|, above `mouth_height`."""
     return np.asarray(
         -0.6 * np.exp(-0.5 * (x / 4) ** 2)
@@ -259,7 +259,7 @@ def mouth_line(x: Array) -> Array:
     )
 
 
-def landmark_directions(shape: FaceShape, centre: Array) -> dict[str, Array]:
+def landmark_directions(shape: FaceShape, centre: Float64) -> dict[str, Float64]:
     """Unit directions from `centre` to the 20 landmarks, which lie on the skin in these
     directions.
     """
@@ -303,7 +303,7 @@ def _landmarks(s: FaceShape) -> dict[str, tuple[float, float]]:
     return out
 
 
-def _front(flat: Array, shape: FaceShape) -> Array:
+def _front(flat: Float64, shape: FaceShape) -> Float64:
     """The foremost points (n, 3) of the skin at x, y (n, 2), by bisection after a coarse march."""
     depth = np.linspace(150, 20, 131)
     line = np.concatenate(
@@ -321,13 +321,13 @@ def _front(flat: Array, shape: FaceShape) -> Array:
     return np.column_stack([flat, low])
 
 
-def _soft(value: Array, width: float) -> Array:
+def _soft(value: Float64, width: float) -> Float64:
     """Smooth step: 0 below -width, 0.5 at 0, 1 above width."""
     t = np.clip(0.5 + 0.5 * value / width, 0, 1)
     return np.asarray(t * t * (3 - 2 * t))
 
 
-def region_membership(points: Array, shape: FaceShape) -> dict[str, Array]:
+def region_membership(points: Float64, shape: FaceShape) -> dict[str, Float64]:
     """Membership in [0, 1] of points (n, 3) in each region of `REGIONS`."""
     s = shape
     x = np.abs(points[:, 0]) / s.width
@@ -359,7 +359,7 @@ def region_membership(points: Array, shape: FaceShape) -> dict[str, Array]:
     return {name: fields[name] for name in REGIONS}
 
 
-def _nose_region(x: Array, y: Array, z: Array, s: FaceShape) -> Array:
+def _nose_region(x: Float64, y: Float64, z: Float64, s: FaceShape) -> Float64:
     """The nose, which widens from its root to the wings."""
     tip = s.nose_tip[1]
     down = np.clip((44 - y) / (44 - tip + 14), 0, 1)
@@ -372,14 +372,14 @@ def _nose_region(x: Array, y: Array, z: Array, s: FaceShape) -> Array:
     )
 
 
-def _hairless_cheek(x: Array, y: Array, mouth: float) -> Array:
+def _hairless_cheek(x: Float64, y: Float64, mouth: float) -> Float64:
     """1 in the centre of the cheeks and below the outer sides of the nose, where no
     beard grows.
     """
     return _soft(16 - np.hypot((x - 36) * 0.8, (y - mouth - 16) * 1.0), 6)
 
 
-def _lips(x: Array, y: Array, z: Array, s: FaceShape) -> Array:
+def _lips(x: Float64, y: Float64, z: Float64, s: FaceShape) -> Float64:
     """The red of the lips: between two arcs that meet in the corners."""
     line = s.mouth_height + mouth_line(x)
     taper = np.sqrt(np.clip(1 - (x / (s.mouth_width - 0.5)) ** 2, 0, 1))
@@ -398,11 +398,11 @@ def _lips(x: Array, y: Array, z: Array, s: FaceShape) -> Array:
     )
 
 
-def _brow_height(x: Array, s: FaceShape) -> Array:
+def _brow_height(x: Float64, s: FaceShape) -> Float64:
     return np.asarray(58.0 + 2.0 * s.brow - 0.012 * (x - 34) ** 2)
 
 
-def _lashes(points: Array, shape: FaceShape) -> Array:
+def _lashes(points: Float64, shape: FaceShape) -> Float64:
     """How dark the closed lids' lashes make each point, 0 to 1."""
     x = np.abs(points[:, 0]) / shape.width
     y = points[:, 1] / shape.height

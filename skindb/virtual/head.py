@@ -20,6 +20,7 @@ from scipy.interpolate import RectBivariateSpline
 
 from skindb.errors import Fault, InputError
 from skindb.geometry.mesh import subdivide, vertex_normals
+from skindb.types import Float64, Index, Mask
 from skindb.virtual.face import (
     REGIONS,
     STEP,
@@ -31,7 +32,6 @@ from skindb.virtual.face import (
 )
 from skindb.virtual.person import Person
 
-Array = NDArray[np.float64]
 CENTRE = np.array([0.0, -38.0, 0.0])  # the skin is star-shaped about this point
 COARSE = (76, 80)  # grid that is relaxed and then interpolated
 # of the field, which is 1 on even skin; with less, a step could leave the head
@@ -60,13 +60,13 @@ SOFTEN = 6
 class Head:
     """A head: triangles, true normals, landmarks, and membership of each vertex in each region."""
 
-    vertices: Array  # (n, 3) mm
-    faces: NDArray[np.int64]  # (m, 3), counter-clockwise from outside
-    normals: Array  # (n, 3)
-    landmarks: Mapping[str, Array]  # name -> (3,) mm
-    membership: Mapping[str, Array]  # region -> (n,) in [0, 1]
+    vertices: Float64  # (n, 3) mm
+    faces: Index  # (m, 3), counter-clockwise from outside
+    normals: Float64  # (n, 3)
+    landmarks: Mapping[str, Float64]  # name -> (3,) mm
+    membership: Mapping[str, Float64]  # region -> (n,) in [0, 1]
 
-    def region(self, name: str) -> NDArray[np.bool_]:
+    def region(self, name: str) -> Mask:
         """Mask (n,) of the vertices with a membership above one half."""
         return np.asarray(self.membership[name] > 0.5)
 
@@ -109,7 +109,7 @@ def parametric_head(
 
 
 @lru_cache(maxsize=2)
-def _relaxed_grid(shape: FaceShape) -> Array:
+def _relaxed_grid(shape: FaceShape) -> Float64:
     """A coarse grid (rows, columns, 3) on the skin, from the top down and from the
     subject's right to the left.
     """
@@ -123,7 +123,9 @@ def _relaxed_grid(shape: FaceShape) -> Array:
     return vertices.reshape(*COARSE, 3)
 
 
-def _resample(grid: Array, rows: int, columns: int, jitter: float, seed: int) -> Array:
+def _resample(
+    grid: Float64, rows: int, columns: int, jitter: float, seed: int
+) -> Float64:
     """Bicubic interpolation of the coarse grid at rows x columns parameters, as (n, 3)."""
     v, u = np.meshgrid(
         np.arange(rows) / (rows - 1), np.arange(columns) / (columns - 1), indexing="ij"
@@ -138,7 +140,7 @@ def _resample(grid: Array, rows: int, columns: int, jitter: float, seed: int) ->
     return np.stack([f.ev(v.ravel(), u.ravel()) for f in spline], axis=1)
 
 
-def _directions(rows: int, columns: int) -> Array:
+def _directions(rows: int, columns: int) -> Float64:
     """Unit directions (rows, columns, 3) from the top row down, from the subject's
     right to the left.
     """
@@ -154,7 +156,7 @@ def _directions(rows: int, columns: int) -> Array:
     )
 
 
-def _shoot(direction: Array, shape: FaceShape) -> Array:
+def _shoot(direction: Float64, shape: FaceShape) -> Float64:
     """Points (n, 3) on the skin along rays from the centre: a search from outside, then
     a few secant steps.
     """
@@ -172,7 +174,7 @@ def _shoot(direction: Array, shape: FaceShape) -> Array:
     return _project(points, shape, rounds=4)
 
 
-def _project(points: Array, shape: FaceShape, *, rounds: int = 1) -> Array:
+def _project(points: Float64, shape: FaceShape, *, rounds: int = 1) -> Float64:
     """Move points near the skin onto it, along the field's gradient (Newton's method
     with a constant slope).
     """
@@ -188,7 +190,7 @@ def _project(points: Array, shape: FaceShape, *, rounds: int = 1) -> Array:
     return points if rounds == 1 else _settle(points, shape)
 
 
-def _settle(points: Array, shape: FaceShape) -> Array:
+def _settle(points: Float64, shape: FaceShape) -> Float64:
     """Move the remaining points onto the skin, those in creases, for which a constant
     slope fails.
     """
@@ -214,7 +216,7 @@ def _settle(points: Array, shape: FaceShape) -> Array:
     return points
 
 
-def _grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
+def _grid_faces(rows: int, columns: int) -> Index:
     """Two triangles per cell, diagonals alternating."""
     index = np.arange(rows * columns).reshape(rows, columns)
     a = index[:-1, :-1]
@@ -224,23 +226,23 @@ def _grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
     even = ((np.arange(rows - 1)[:, None] + np.arange(columns - 1)) % 2 == 0)[..., None]
     lower = np.where(even, np.stack([a, d, c], -1), np.stack([a, d, b], -1))
     second = np.where(even, np.stack([a, c, b], -1), np.stack([d, c, b], -1))
-    return np.stack([lower, second], axis=2).reshape(-1, 3).astype(np.int64)
+    return np.stack([lower, second], axis=2).reshape(-1, 3).astype(int)
 
 
 @dataclass(frozen=True)
 class HeadModel:
     """Contents of a head model file; modes are absent in a plain head."""
 
-    vertices: Array  # (n, 3) mm
-    faces: NDArray[np.int64]  # (m, 3)
+    vertices: Float64  # (n, 3) mm
+    faces: Index  # (m, 3)
     landmarks: Mapping[str, int] = dataclasses.field(
         default_factory=dict
     )  # name -> vertex
     # name -> vertices
-    regions: Mapping[str, NDArray[np.int64]] = dataclasses.field(default_factory=dict)
-    identity: Array | None = None  # (modes, n, 3) mm per standard deviation
+    regions: Mapping[str, Index] = dataclasses.field(default_factory=dict)
+    identity: Float64 | None = None  # (modes, n, 3) mm per standard deviation
     # name -> (modes,) coefficients of a group's mean
-    traits: Mapping[str, Array] = dataclasses.field(default_factory=dict)
+    traits: Mapping[str, Float64] = dataclasses.field(default_factory=dict)
 
 
 def load_head(path: Path) -> HeadModel:
@@ -264,9 +266,7 @@ def load_head(path: Path) -> HeadModel:
         mesh = trimesh.load(path, process=False, maintain_order=True, force="mesh")
         return _checked(
             path,
-            HeadModel(
-                np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
-            ),
+            HeadModel(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, int)),
         )
     try:
         with np.load(path, allow_pickle=False) as archive:
@@ -325,7 +325,7 @@ def _plain(a: Mapping[str, NDArray[Any]]) -> HeadModel:
     vertex = a.get("landmark_vertex", np.array([]))
     landmarks = {str(n): int(v) for n, v in zip(names, vertex, strict=True)}
     return HeadModel(
-        a["vertices"].astype(float), a["faces"].astype(np.int64), landmarks, _regions(a)
+        a["vertices"].astype(float), a["faces"].astype(int), landmarks, _regions(a)
     )
 
 
@@ -333,9 +333,9 @@ def _population(a: Mapping[str, NDArray[Any]]) -> HeadModel:
     """Mean shape, identity modes, coefficients of group means; quads are split, eye and
     mouth caps closed.
     """
-    faces = a["quads"].astype(np.int64)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+    faces = a["quads"].astype(int)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
     if "caps" in a:
-        faces = np.concatenate([faces, a["caps"].astype(np.int64)])
+        faces = np.concatenate([faces, a["caps"].astype(int)])
     identity = (
         a["id_q"] * a["id_scale"][:, None, None].astype(float) if "id_q" in a else None
     )
@@ -352,7 +352,7 @@ def _population(a: Mapping[str, NDArray[Any]]) -> HeadModel:
     )
 
 
-def _regions(a: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[np.int64]]:
+def _regions(a: Mapping[str, NDArray[Any]]) -> dict[str, Index]:
     if "region" not in a:
         return {}
     out = {
@@ -391,7 +391,7 @@ def head_of_file(path: Path, person: Person) -> tuple[Head, Head]:
     )
 
 
-def _person_shape(model: HeadModel, person: Person) -> Array:
+def _person_shape(model: HeadModel, person: Person) -> Float64:
     if model.identity is None:
         return model.vertices
     coefficient = 0.8 * person.stream(1).standard_normal(len(model.identity))
@@ -402,7 +402,7 @@ def _person_shape(model: HeadModel, person: Person) -> Array:
     return np.asarray(model.vertices + np.tensordot(coefficient, model.identity, 1))
 
 
-def _membership(model: HeadModel) -> dict[str, Array]:
+def _membership(model: HeadModel) -> dict[str, Float64]:
     """Smooth memberships of the regions that skindb uses, from the labels of the file."""
     n = len(model.vertices)
     edge = np.concatenate(

@@ -14,10 +14,10 @@ from typing import Any
 
 import imagecodecs
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.clock import Clock, SimulatedClock
 from skindb.errors import Fault, InputError
+from skindb.types import Float64, Index
 from skindb.virtual.devices import (
     GAUGE_FAULTS,
     DeviceFaults,
@@ -240,14 +240,14 @@ class Laboratory:
         self._triggers[camera] += 1
         return self._triggers[camera] - 1
 
-    def _hot_pixels(self) -> NDArray[np.int64]:
+    def _hot_pixels(self) -> Index:
         camera = self._record["cameras"][0]
         rng = np.random.default_rng(self.faults.dome.seed)
         high = [camera["height"], camera["width"]]
         return rng.integers(0, high, (self.faults.hot_pixels, 2))
 
 
-def _read(path: Path) -> NDArray[np.float64]:
+def _read(path: Path) -> Float64:
     return np.asarray(imagecodecs.png_decode(path.read_bytes()), np.float64)
 
 

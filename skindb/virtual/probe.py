@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from skindb.cache import cached_arrays
 from skindb.files import private_file
 from skindb.optics.transport import Walk, radial_profile, random_walk
+from skindb.types import Float64
 from skindb.virtual.dome import Sensor, write_png
 from skindb.virtual.skin import Site
 
-Array = NDArray[np.float64]
 # mm
 FIBRES = 28
 FIRST = 1.0
@@ -57,9 +57,9 @@ PROBE_SENSOR = Sensor(
 class ProbeTruth:
     """True light at the fibres."""
 
-    distance: Array  # (fibre,) mm
-    profile: Array  # (site, fibre, channel) mm^-2
-    error: Array  # (site, fibre, channel) standard error of the random walk
+    distance: Float64  # (fibre,) mm
+    profile: Float64  # (site, fibre, channel) mm^-2
+    error: Float64  # (site, fibre, channel) standard error of the random walk
 
 
 @lru_cache(maxsize=4)
@@ -84,8 +84,8 @@ def fibre_profiles(walk: Walk, sites: Sequence[Site]) -> ProbeTruth:
     """Diffuse reflectance R(r) averaged over the faces of the source and of each fibre,
     for every site and channel.
     """
-    distance: Array = FIRST + PITCH * np.arange(FIBRES, dtype=np.float64)
-    edges: Array = BIN * np.arange(
+    distance: Float64 = FIRST + PITCH * np.arange(FIBRES, dtype=float)
+    edges: Float64 = BIN * np.arange(
         round((distance[-1] + 1.0) / BIN) + 1, dtype=np.float64
     )
     middle = (edges[:-1] + edges[1:]) / 2
@@ -103,7 +103,7 @@ def fibre_profiles(walk: Walk, sites: Sequence[Site]) -> ProbeTruth:
     return ProbeTruth(distance, profile, error)
 
 
-def _disc_shares(middle: Array, distance: Array) -> Array:
+def _disc_shares(middle: Float64, distance: Float64) -> Float64:
     """Fraction (n, ring) of each ring around a point that lies inside a face at each of
     n distances.
     """
@@ -117,7 +117,7 @@ def _disc_shares(middle: Array, distance: Array) -> Array:
     return np.asarray(arc / arc.sum(axis=1, keepdims=True))
 
 
-def _smooth(distance: Array, value: Array, error: Array) -> Array:
+def _smooth(distance: Float64, value: Float64, error: Float64) -> Float64:
     """Whittaker smoothing of log(r^2 R), which is linear far from the source by diffusion.
 
     Each fibre is weighted by the error of the walk: near ones hardly change, far ones
@@ -190,7 +190,7 @@ def write_probe(
     return truth
 
 
-def _layout(rng: np.random.Generator) -> tuple[Array, Array]:
+def _layout(rng: np.random.Generator) -> tuple[Float64, Float64]:
     """Centres (fibre, 2) px, and spots (fibre, y, x): 1 within INSIDE of the centre, a
     soft edge, 0 before the next.
     """

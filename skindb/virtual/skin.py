@@ -11,15 +11,14 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from skindb.files import package_json
 from skindb.optics.diffusion import dipole_s, scattering_coefficients
+from skindb.types import Float64
 from skindb.virtual.head import Head
 from skindb.virtual.person import Person
 
-Array = NDArray[np.float64]
 BLOOD_SPREAD = 0.06  # log green, between people of equal melanin
 # The measured materials with the smallest Lambertian fraction (which a fit cannot
 # distinguish from R_d); two broad lobes, two sharp ones
@@ -28,8 +27,8 @@ PATCH = 6.0  # mm about a probe site over which its colour is averaged
 
 
 def smooth_noise(
-    points: Array, wavelength: float, *, rng: np.random.Generator, waves: int = 40
-) -> Array:
+    points: Float64, wavelength: float, *, rng: np.random.Generator, waves: int = 40
+) -> Float64:
     """A Gaussian-like field (n,) of zero mean and unit variance over `points` (n, 3)
     mm: a sum of plane waves.
 
@@ -44,7 +43,7 @@ def smooth_noise(
         points.astype(np.float32) @ vector.T.astype(np.float32)
         + phase.astype(np.float32)
     )
-    return np.asarray(wave.sum(axis=1, dtype=np.float64) * np.sqrt(2 / waves))
+    return np.asarray(wave.sum(axis=1, dtype=float) * np.sqrt(2 / waves))
 
 
 @dataclass(frozen=True)
@@ -72,15 +71,15 @@ class SkinTables:
     """The constants of skin.json."""
 
     sites: tuple[str, ...]
-    mean: dict[tuple[str, str], Array]  # ancestry and gender -> R_d (site, channel)
+    mean: dict[tuple[str, str], Float64]  # ancestry and gender -> R_d (site, channel)
     # ancestry and gender -> relative standard deviation between people, green, cheek
     spread: dict[tuple[str, str], float]
     gloss: dict[str, Gloss]  # by region; "elsewhere" for the others
-    sigma_tr: dict[str, Array]  # paper, table 2: site -> mean (channel,) in mm^-1
+    sigma_tr: dict[str, Float64]  # paper, table 2: site -> mean (channel,) in mm^-1
     effects: dict[str, ConditionEffect]  # by condition
 
     @property
-    def melanin(self) -> Array:
+    def melanin(self) -> Float64:
         """Axis of melanin in log R_d, 1 in green: from one cheek to a darker one."""
         light, dark = (
             self.mean[group, "female"][self.sites.index("cheek")]
@@ -89,14 +88,14 @@ class SkinTables:
         return _axis(light, dark)
 
     @property
-    def haemoglobin(self) -> Array:
+    def haemoglobin(self) -> Float64:
         """Axis of haemoglobin in log R_d, 1 in green: from pale neck to ruddy chin."""
         mean = self.mean["european", "female"]
         neck, chin = (mean[self.sites.index(site)] for site in ("neck", "chin"))
         return _axis(neck, chin)
 
 
-def _axis(light: Array, dark: Array) -> Array:
+def _axis(light: Float64, dark: Float64) -> Float64:
     """Direction from a lighter to a darker colour in log reflectance, 1 in green."""
     step = np.log(light) - np.log(dark)
     return np.asarray(step / step[1])
@@ -125,24 +124,26 @@ class Site:
     """Site of the probe, and its optical parameters; arrays (channel,)."""
 
     name: str
-    position: Array  # (3,) mm
-    diffuse_reflectance: Array
-    sigma_tr: Array  # mm^-1
-    sigma_a: Array  # mm^-1
-    sigma_s_prime: Array  # mm^-1
+    position: Float64  # (3,) mm
+    diffuse_reflectance: Float64
+    sigma_tr: Float64  # mm^-1
+    sigma_a: Float64  # mm^-1
+    sigma_s_prime: Float64  # mm^-1
 
 
 @dataclass(frozen=True)
 class Skin:
     """True parameters per vertex."""
 
-    diffuse: Array  # (n, 3) R_d
-    weights: Array  # (n, k) of MATERIALS
-    sigma_tr: Array  # (n, 3) mm^-1
+    diffuse: Float64  # (n, 3) R_d
+    weights: Float64  # (n, k) of MATERIALS
+    sigma_tr: Float64  # (n, 3) mm^-1
     sites: tuple[Site, ...]
 
 
-def skin_of(head: Head, person: Person, *, material_albedo: Array, eta: float) -> Skin:
+def skin_of(
+    head: Head, person: Person, *, material_albedo: Float64, eta: float
+) -> Skin:
     """The skin of `person` on `head`.
 
     Parameters
@@ -168,7 +169,9 @@ def skin_of(head: Head, person: Person, *, material_albedo: Array, eta: float) -
     )
 
 
-def _diffuse_reflectance(head: Head, person: Person, effect: ConditionEffect) -> Array:
+def _diffuse_reflectance(
+    head: Head, person: Person, effect: ConditionEffect
+) -> Float64:
     """Group and site mean, moved along the melanin and haemoglobin axes; then hair."""
     tables = skin_tables()
     sites = tables.sites
@@ -197,7 +200,7 @@ def _diffuse_reflectance(head: Head, person: Person, effect: ConditionEffect) ->
     return np.asarray(np.clip(colour * (1 - _hair(head, person)), 0.008, 0.95))
 
 
-def _pigment(head: Head, person: Person) -> tuple[Array, Array]:
+def _pigment(head: Head, person: Person) -> tuple[Float64, Float64]:
     """Melanin and blood of each vertex about the mean, log green: mottling, freckles,
     age spots, flushed cheeks.
     """
@@ -236,7 +239,7 @@ def _pigment(head: Head, person: Person) -> tuple[Array, Array]:
     return np.asarray(melanin + dark), blood
 
 
-def _hair(head: Head, person: Person) -> Array:
+def _hair(head: Head, person: Person) -> Float64:
     """Fraction of light (n, 3) that brows, lashes and beard stubble absorb."""
     rng = person.stream(3)
     m = head.membership
@@ -251,8 +254,8 @@ def _hair(head: Head, person: Person) -> Array:
 
 
 def _weights(
-    head: Head, person: Person, effect: ConditionEffect, material_albedo: Array
-) -> Array:
+    head: Head, person: Person, effect: ConditionEffect, material_albedo: Float64
+) -> Float64:
     """Smooth non-negative weights with the wanted specular albedo at normal incidence."""
     rng = person.stream(4)
     p = head.vertices
@@ -283,7 +286,7 @@ def _weights(
 
 
 def _sites(
-    head: Head, person: Person, diffuse: Array, effect: ConditionEffect, eta: float
+    head: Head, person: Person, diffuse: Float64, effect: ConditionEffect, eta: float
 ) -> tuple[Site, ...]:
     """The probe's sites: sigma_tr about table 2, and the coefficients it and the local
     R_d imply (paper, section 9).
@@ -301,7 +304,7 @@ def _sites(
         sigma_tr = np.clip(mean * personal * local * effect.translucency, 0.3, 3.0)
         s, _ = dipole_s(colour, eta=eta)
         sigma_a, sigma_s = (
-            np.asarray(x, np.float64) for x in scattering_coefficients(s, sigma_tr)
+            np.asarray(x, float) for x in scattering_coefficients(s, sigma_tr)
         )
         sites.append(
             Site(name, head.vertices[vertex], colour, sigma_tr, sigma_a, sigma_s)
@@ -327,7 +330,7 @@ def _site_vertex(head: Head, name: str) -> int | None:
     return int(ids[((head.vertices[ids] - middle) ** 2).sum(axis=1).argmin()])
 
 
-def _sigma_tr(points: Array, sites: tuple[Site, ...]) -> Array:
+def _sigma_tr(points: Float64, sites: tuple[Site, ...]) -> Float64:
     """1/sigma_tr interpolated between the sites (Shepard); the cheek counts on both sides."""
     if not sites:
         return np.broadcast_to(skin_tables().sigma_tr["cheek"], (len(points), 3)).copy()

@@ -184,7 +184,7 @@ def registered_parts(
             {variables.SURFEL_INDEX: index, variables.REGION_MASK: mask.T},
             coords={"region": list(masks)},
         )
-    face = {FACE: np.ones(fitted.sizes["surfel"], np.bool_)}
+    face = {FACE: np.ones(fitted.sizes["surfel"], bool)}
     groups[TABLES] = region_tables(fitted, face | masks)
     return groups
 

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.analysis.brdf import population_basis
 from skindb.analysis.edit import apply_traits, with_basis
@@ -24,7 +23,7 @@ from skindb.render.rendering import frontal_camera, radiance_of
 from skindb.schema import variables
 from skindb.schema.consent import require_consent
 from skindb.store import STUDY, Database, Record, require_fresh
-from skindb.types import Progress, silent
+from skindb.types import Float32, Progress, silent
 from skindb.workflow import studies
 from skindb.workflow.audit import logged
 from skindb.workflow.cohorts import current_registrations, registered_datasets
@@ -236,7 +235,7 @@ def basis_grid(
     }
 
 
-def _root_mean_square(values: NDArray[np.float32]) -> float:
+def _root_mean_square(values: Float32) -> float:
     return float(np.sqrt((values**2).mean()))
 
 

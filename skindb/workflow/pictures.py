@@ -277,9 +277,7 @@ def _diffusion_lengths(db: Database, site: str) -> dict[str, float]:
             continue
         sites = model["translucency"].to_dataset()
         if site in [str(name) for name in sites["site"].values]:
-            sigma = (
-                sites[variables.SITE_SIGMA_TR].sel(site=site).values.astype(np.float64)
-            )
+            sigma = sites[variables.SITE_SIGMA_TR].sel(site=site).values.astype(float)
             if (np.isfinite(sigma) & (sigma > 0)).all():
                 lengths[take] = float((1 / sigma).mean())
     return lengths

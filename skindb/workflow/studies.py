@@ -14,10 +14,8 @@ from functools import partial, wraps
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import xarray as xr
 from dask.delayed import Delayed, delayed
-from numpy.typing import NDArray
 
 from skindb.analysis.regions import common_landmarks
 from skindb.analysis.registration import describe_registration
@@ -34,6 +32,7 @@ from skindb.schema.cohort import require_same_fit
 from skindb.schema.notes import Note, note, unique_notes
 from skindb.store import STUDY, Database, Lookup, Record, Staleness, require_text
 from skindb.threads import on_one_blas_thread
+from skindb.types import Float32
 from skindb.workflow.audit import logged_action
 from skindb.workflow.cohorts import (
     current_registrations,
@@ -50,7 +49,7 @@ STUDY_NAME = r"[A-Za-z0-9_-]{1,64}"
 
 def dictionary_tables(
     names: Sequence[str], disc: float, dictionary: Path | None = None
-) -> NDArray[np.float32]:
+) -> Float32:
     """Tables (nh, nd, np, m) that takes were fitted with, averaged over the discs of the lights.
 
     Parameters
