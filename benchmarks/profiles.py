@@ -13,7 +13,7 @@ from typing import Annotated
 
 import numpy as np
 
-from skindb.bench.subsurface import across, ring_mean, rings
+from benchmarks.curves import across, ring_mean, rings
 from skindb.fit.translucency import MODELS
 from skindb.optics.transport import random_walk
 

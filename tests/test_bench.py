@@ -12,11 +12,8 @@ from click.testing import CliRunner
 from skindb.bench import KERNELS, run
 from skindb.bench.curve import Curve, Point
 from skindb.bench.photometry import model_samples
-from skindb.bench.subsurface import transport_curves
 from skindb.cli import cli
 from skindb.fit import refit
-from skindb.optics.diffusion import dipole_profile
-from skindb.optics.transport import transport_profile
 from skindb.reflectance.separation import surface_lobes
 from skindb.reflectance.tables import stored_brdf
 from skindb.schema import dataset, label
@@ -101,19 +98,6 @@ def test_curve__ratio_is_to_the_stated_method():
     )
     assert [curve.ratio(p) for p in curve.points] == [1.0, 0.25]
     assert math.isnan(curve.ratio(Point("c", "", math.nan, 0.1)))
-
-
-@pytest.mark.slow
-def test_transport_curves__distances_are_mean_free_paths():
-    """With sigma_t' = 1, the dipole at one mean free path is twice the random walk."""
-    (curve,) = transport_curves(quick=True)
-    (point,) = [p for p in curve.points if p.name == "skindb dipole, albedo 0.7"]
-    for r in (1.0, 2.0):
-        ratio = dipole_profile(r, 0.3, 0.7, eta=1.3) / transport_profile(
-            r, 0.3, 0.7, eta=1.3
-        )
-        # noise 8 %
-        assert point.details[f"at_{r:g}"] == pytest.approx(float(ratio) - 1, abs=0.25)
 
 
 def test_model_samples__have_what_fits_of_surfaces_read():

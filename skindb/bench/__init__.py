@@ -19,15 +19,11 @@ KERNELS = (
     "albedo",
     "nmf",
     "probe",
-    "transport",
     "inverse",
     "subsurface",
-    "disc",
     "exposures",
     "pyramid",
     "textures",
-    "components",
-    "permutations",
 )
 __getattr__, __dir__, _ = lazy_loader.attach(
     __name__, submod_attrs={"run": ["run_bench", "table_of"]}

@@ -13,6 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.bench.curve import Curve, Point, cpu_time
+from skindb.bench.surface import spiral, unit
 from skindb.calibration._merge_kernels import OK
 from skindb.calibration.radiance import merge_exposures
 from skindb.fit import albedo, estimate_diffuse_reflectance, estimate_normals, normals
@@ -69,12 +70,12 @@ def model_samples(
     each with at least a fifth of `gloss`. Noise is relative, with `floor` [sr^-1] added
     in quadrature.
     """
-    normal = _unit(_spiral(surfels, 0.6) + 0.05 * rng.normal(size=(surfels, 3)))
-    position = 80 * _spiral(surfels, 0.6)
-    light = 880 * _spiral(lights, 0.1)
-    camera = 830 * _spiral(cameras, 0.5)
-    wi = _unit(light - position[:, None])
-    wo = _unit(camera - position[:, None])
+    normal = unit(spiral(surfels, 1, 0.4) + 0.05 * rng.normal(size=(surfels, 3)))
+    position = spiral(surfels, 80, 0.4)
+    light = spiral(lights, 880, 0.9)
+    camera = spiral(cameras, 830, 0.5)
+    wi = unit(light - position[:, None])
+    wo = unit(camera - position[:, None])
     lit = np.einsum("nk,ntk->nt", normal, wi)
     seen = np.einsum("nk,ntk->nt", normal, wo)
     brightness = rng.uniform(0.7, 1.2, (surfels, 1))
@@ -98,7 +99,7 @@ def model_samples(
     values = {
         variables.REFLECTANCE_SAMPLE: sample,
         variables.SURFEL_POSITION: position,
-        variables.SURFEL_NORMAL: _unit(normal + off),
+        variables.SURFEL_NORMAL: unit(normal + off),
         variables.SURFEL_AREA: np.ones(surfels),
         variables.LIGHT_POSITION: light,
         variables.LIGHT_DISC_RADIUS: np.zeros(lights),
@@ -123,19 +124,6 @@ def _lobe_weights(
         weight[:] = 0
         weight[:, list(lobes)] = rng.uniform(gloss / 5, gloss, (surfels, len(lobes)))
     return weight
-
-
-def _spiral(n: int, lowest: float) -> Array:
-    """(n, 3) directions, evenly spread around +z down to the cosine `lowest`."""
-    z = 1 - (np.arange(n) + 0.5) / n * (1 - lowest)
-    phi = np.pi * (3 - np.sqrt(5)) * np.arange(n)
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
-
-
-def _unit(v: Array) -> Array:
-    """Vectors (..., 3) of length one."""
-    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
 
 
 def _domes(quick: bool) -> list[tuple[str, ModelSamples]]:

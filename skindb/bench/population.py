@@ -6,13 +6,9 @@ from functools import partial
 from importlib.util import find_spec
 
 import numpy as np
-from scipy import stats
 from scipy.ndimage import gaussian_filter
-from sklearn.decomposition import PCA
 
 from skindb.bench.curve import Curve, Point, cpu_time
-from skindb.numerics.factorise import principal_axes
-from skindb.numerics.inference import permutation_p
 from skindb.numerics.texture import (
     LEVELS,
     build,
@@ -23,9 +19,6 @@ from skindb.numerics.texture import (
     synthesise,
 )
 from skindb.types import Array
-
-TAKES = 87
-AXES = 5
 
 
 def pyramid_curves(quick: bool) -> list[Curve]:
@@ -114,101 +107,10 @@ def textures_curves(quick: bool) -> list[Curve]:
     ]
 
 
-def components_curves(quick: bool) -> list[Curve]:
-    """Principal axes of a few long vectors, compared with scikit-learn."""
-    length = 10_000 if quick else 300_000
-    rng = np.random.default_rng(0)
-    vectors = rng.standard_normal((TAKES, AXES)) @ rng.standard_normal((AXES, length))
-    vectors += 0.1 * rng.standard_normal((TAKES, length))
-    exact = PCA(AXES, svd_solver="full").fit(vectors).components_
-    points = []
-    for solver in ("full", "randomized"):
-        fit = partial(PCA(AXES, svd_solver=solver, random_state=0).fit, vectors)
-        seconds, axes = cpu_time(fit)
-        error = _axes_off(axes.components_, exact)
-        points.append(Point("scikit-learn", solver, seconds, error))
-    for setting, dtype in (
-        ("", np.float64),
-        ("vectors in single precision", np.float32),
-    ):
-        work = partial(principal_axes, vectors.astype(dtype), AXES)
-        seconds, principal = cpu_time(work)
-        error = _axes_off(principal.axes, exact)
-        points.append(Point("skindb", setting, seconds, error))
-    base = "scikit-learn, full"
-    return [
-        Curve(
-            kernel="components",
-            error_of=f"largest difference of {AXES} axes of {TAKES} vectors of {length:,}",
-            reference=base,
-            seconds_of="an analysis",
-            base=base,
-            points=points,
-        )
-    ]
-
-
-def permutations_curves(quick: bool) -> list[Curve]:
-    """P values of 30 quantities of 87 subjects by number of permutations, and of
-    scipy.stats.permutation_test.
-    """
-    rng = np.random.default_rng(0)
-    group = (np.arange(TAKES) % 4 == 0).astype(float)
-    values = rng.standard_normal((TAKES, 30))
-    values += 0.4 * group[:, None] * np.linspace(0, 1, 30)
-
-    def p_values(draws: int, seed: int = 1) -> Array:
-        rng = np.random.default_rng(seed)
-        return permutation_p(values, group, max_draws=draws, rng=rng)[0]
-
-    exact_draws = 20_000 if quick else 200_000
-    exact = p_values(exact_draws, 7)
-    points = []
-    for draws in (100, 1000) if quick else (100, 1000, 10_000):
-        seconds, p = cpu_time(partial(p_values, draws))
-        setting = f"{draws} permutations"
-        points.append(Point("skindb", setting, seconds, _largest(p - exact)))
-    draws = 100 if quick else 1000
-    seconds, p = cpu_time(partial(_p_values_of_scipy, values, group, draws))
-    name = "SciPy permutation_test of Welch's statistic, which differs from HC3's"
-    setting = f"{draws} permutations"
-    points.append(Point(name, setting, seconds, _largest(p - exact)))
-    return [
-        Curve(
-            kernel="permutations",
-            error_of="largest error of a p value",
-            reference=f"{exact_draws:,} permutations",
-            seconds_of="a test",
-            base="skindb, 1000 permutations",
-            points=points,
-        )
-    ]
-
-
-def _p_values_of_scipy(values: Array, group: Array, draws: int) -> Array:
-    def welch(x: Array, y: Array, axis: int = 0) -> Array:
-        return np.asarray(stats.ttest_ind(x, y, equal_var=False, axis=axis).statistic)
-
-    test = stats.permutation_test(
-        (values[group == 1], values[group == 0]),
-        welch,
-        n_resamples=draws,
-        vectorized=True,
-        axis=0,
-        rng=np.random.default_rng(1),
-    )
-    return np.asarray(test.pvalue)
-
-
 def _quantiles(image: Array, levels: int) -> Array:
     parts = image_parts(image, levels)
     shapes = [part.shape for part in parts]
     return part_quantiles(parts, level_fractions(np.ones(image.shape), shapes))
-
-
-def _axes_off(axes: Array, exact: Array) -> float:
-    sign = np.sign((axes * exact).sum(axis=1, keepdims=True))
-    return _largest(axes * sign - exact)
 
 
 def _largest(difference: Array) -> float:

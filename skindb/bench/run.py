@@ -7,7 +7,7 @@ from __future__ import annotations
 import json
 import platform
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -17,8 +17,6 @@ from threadpoolctl import threadpool_limits
 from skindb.bench.curve import Curve, plot_curves
 from skindb.bench.photometry import albedo_curves, exposures_curves, normals_curves
 from skindb.bench.population import (
-    components_curves,
-    permutations_curves,
     pyramid_curves,
     textures_curves,
 )
@@ -27,28 +25,24 @@ from skindb.bench.subsurface import (
     probe_curves,
     require_mpmath,
     subsurface_curves,
-    transport_curves,
 )
-from skindb.bench.surface import disc_curves, nmf_curves, refit_curves, surface_curves
+from skindb.bench.surface import nmf_curves, refit_curves, surface_curves
 from skindb.files import make_private, plain, private_file
 from skindb.types import Progress
 
-CURVES: dict[str, Callable[[bool], list[Curve]]] = {
+Curves = Callable[[bool], list[Curve]]
+CURVES: dict[str, Curves] = {
     "surface": surface_curves,
     "refit": refit_curves,
     "normals": normals_curves,
     "albedo": albedo_curves,
     "nmf": nmf_curves,
     "probe": probe_curves,
-    "transport": transport_curves,
     "inverse": inverse_curves,
     "subsurface": subsurface_curves,
-    "disc": disc_curves,
     "exposures": exposures_curves,
     "pyramid": pyramid_curves,
     "textures": textures_curves,
-    "components": components_curves,
-    "permutations": permutations_curves,
 }
 MAX_REASON = 300  # characters
 
@@ -57,6 +51,7 @@ def run_bench(
     out: Path,
     *,
     only: Sequence[str] = (),
+    curves: Mapping[str, Curves] = CURVES,
     quick: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -67,7 +62,10 @@ def run_bench(
     out
         Folder for bench.json and one PNG per kernel; created if it does not exist.
     only
-        Kernels of `skindb.bench.KERNELS`; empty for all.
+        Kernels to measure; empty for all.
+    curves
+        Function that measures the curves of each kernel; by default those of
+        `skindb.bench.KERNELS`.
     quick
         Smaller problems and fewer settings; these numbers are not for publication.
     progress
@@ -81,7 +79,7 @@ def run_bench(
         failure), `errors` (the reason for every kernel that stopped with an error) and
         `failures` (one line for each unsuitable method and each error).
     """
-    kernels = [kernel for kernel in CURVES if kernel in only or not only]
+    kernels = [kernel for kernel in curves if kernel in only or not only]
     if "inverse" in kernels:
         require_mpmath()  # fails before the work begins
     make_private(out)
@@ -95,9 +93,9 @@ def run_bench(
             report(f"curves: {kernel}", i, len(kernels))
             since = time.perf_counter()
             try:
-                curves = CURVES[kernel](quick)
-                plot_curves(curves, out / f"{kernel}.png")
-                points += [row for curve in curves for row in _rows(curve)]
+                measured = curves[kernel](quick)
+                plot_curves(measured, out / f"{kernel}.png")
+                points += [row for curve in measured for row in _rows(curve)]
             # the other kernels are measured, and the error is reported
             except Exception as error:  # noqa: BLE001
                 errors[kernel] = _reason(error)

@@ -26,27 +26,17 @@ from skindb.optics.diffusion import (
 from skindb.optics.dipole_tree import subsurface_exitance
 from skindb.optics.fresnel import boundary_factor
 from skindb.optics.transport import (
-    ANISOTROPY,
     Walk,
-    half_space_profile,
-    moment_basis,
     radial_profile,
     random_walk,
 )
 from skindb.types import Array, Float32
 
 ETA = 1.3
-DISTANCE = (0.5, 1.0, 2.0, 5.0, 10.0)  # transport mean free paths
-WIDTH = 1.05  # rings extend from r / WIDTH to r WIDTH
-NOISY = 0.1  # relative standard error of the random walk above which a ring is ignored
 FAR_OFF = 0.25  # relative error above which a fit counts as failed
 FAILS_WITH_FREE_GAIN = "a free gain has two minima; measure the gain"
 FAILS_WHERE_NEAR = "the profile is wrong where the albedo is low or the fibres are near"
 CANCELLATION = "1 - alpha' is lost to cancellation"
-DIFFUSION = (
-    "the diffusion approximation is invalid within some mean free paths and for "
-    "strong absorption"
-)
 FIBRES = 1 + 0.5 * np.arange(28)  # mm, of the probe
 # sigma_a, sigma_s' [mm-1] of kinds of skin; albedo 0.98 to 0.59
 SKIN = ((0.05, 2.4), (0.17, 2.3), (0.36, 2.9), (0.3, 1.0), (0.54, 0.79))
@@ -154,98 +144,6 @@ def _exact(value: float) -> float:
             return (1 - s * s / 3) / 2 * boundary * mpmath.exp(-s) - target
 
         return float(mpmath.findroot(off, bracket, solver="anderson", tol=1e-60))
-
-
-def transport_curves(quick: bool) -> list[Curve]:
-    """R(r) of a medium by model, and by moments of several degrees, from which the
-    table is made.
-    """
-    walk = _walk(quick)
-    points = []
-    r = np.linspace(0.5, 20, 1000)
-    for albedo in (0.7, 0.9) if quick else (0.3, 0.7, 0.9, 0.99):
-        ratio = (1 - albedo) / albedo
-        # in units of 1 / sigma_s', of which a mean free path is `albedo`
-        middle = np.array(DISTANCE) * albedo
-        walked = rings(walk, ratio, middle)
-        ring = across(middle)
-        setting = f"albedo {albedo:g}"
-        for name, model in MODELS.items():
-            model.profile(1.0, ratio, 1.0, eta=ETA)  # makes the table
-            work = partial(model.profile, r, ratio, 1.0, eta=ETA)
-            seconds, _ = cpu_time(work, len(r))
-            profile = model.profile(ring, ratio, 1.0, eta=ETA)
-            mean = ring_mean(profile, middle)
-            points.append(_profile(f"skindb {name}", setting, seconds, mean, walked))
-        for degree in (3, 7, 11) if quick else (3, 5, 7, 9, 11, 13):
-            basis = moment_basis(degree, eta=ETA, anisotropy=ANISOTROPY)
-            seconds, _ = cpu_time(partial(half_space_profile, r, ratio, basis), len(r))
-            with np.errstate(invalid="ignore"):
-                level, kappa = half_space_profile(ring.ravel(), ratio, basis)
-            profile = np.exp(level - kappa * ring.ravel()).reshape(ring.shape)
-            mean = ring_mean(profile, middle)
-            name = f"moments of degree {degree}"
-            points.append(_profile(name, setting, seconds, mean, walked))
-    distances = ", ".join(f"{d:g}" for d in DISTANCE)
-    return [
-        Curve(
-            kernel="transport",
-            error_of=f"RMS over {distances} mean free paths of the relative error of R(r)",
-            reference=f"random walk of {walk.packets:,} photons, with the noise `walk_noise`",
-            seconds_of="a distance",
-            base="skindb dipole, albedo 0.9",
-            points=points,
-        )
-    ]
-
-
-def across(middle: Array, width: float = WIDTH) -> Array:
-    """Distances (21, d) from r / width to r width of a ring around each distance r (d,)."""
-    return np.linspace(middle / width, middle * width, 21)
-
-
-def ring_mean(values: Array, middle: Array, width: float = WIDTH) -> Array:
-    """Mean (d,) over each ring of values at `across`, weighted by area."""
-    r = across(middle, width)
-    return np.asarray((values * r).sum(axis=0) / r.sum(axis=0))
-
-
-def rings(
-    walk: Walk, ratio: float, middle: Array, width: float = WIDTH
-) -> tuple[Array, Array]:
-    """R in a ring around each distance, and its relative standard error; sigma_s' = 1,
-    sigma_a = `ratio`.
-    """
-    edges = [np.array([r / width, r * width]) for r in middle]
-    profiles = [radial_profile(walk, ratio, 1.0, edge) for edge in edges]
-    value = np.concatenate([v for v, _ in profiles])
-    error = np.concatenate([e for _, e in profiles])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return value, np.asarray(np.where(value > 0, error / value, np.inf))
-
-
-def _profile(
-    name: str, setting: str, seconds: float, mean: Array, walked: tuple[Array, Array]
-) -> Point:
-    """The point of ring means, compared with values and noise of the random walk."""
-    value, noise = walked
-    clear = (noise < NOISY) & np.isfinite(mean)
-    off = mean[clear] / value[clear] - 1
-    error = float(np.sqrt((off**2).mean()))
-    distances = np.array(DISTANCE)
-    details = {
-        f"at_{d:g}": float(e) for d, e in zip(distances[clear], off, strict=True)
-    }
-    details["walk_noise"] = float(np.sqrt((noise[clear] ** 2).mean()))
-    negative = ", ".join(f"{d:g}" for d in distances[np.isnan(mean)])
-    failure = ""
-    if name.endswith("dipole"):
-        failure = DIFFUSION
-    elif negative:
-        failure = f"negative at {negative} mean free paths (not in the error): too few moments"
-    elif name.startswith("moments") and error > 0.1:
-        failure = f"{error:.0%} off: too few moments"
-    return Point(name, setting, seconds, error, failure, details)
 
 
 def probe_curves(quick: bool) -> list[Curve]:

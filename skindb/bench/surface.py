@@ -18,11 +18,9 @@ from sklearn.exceptions import ConvergenceWarning
 from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.fit.surface import MIN_SAMPLES, NOISE_FLOOR_SURFACE
 from skindb.numerics.factorise import nmf, relative_error
-from skindb.optics.angles import directions, half_difference
+from skindb.optics.angles import half_difference
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.dictionary import (
-    FAR_RULE,
-    NEAR_RULE,
     Dictionary,
     convolve_disc,
     embedded_dictionary,
@@ -31,7 +29,7 @@ from skindb.reflectance.mixture import Mixture, basis_rows
 from skindb.reflectance.model import Block, Comparison, SurfaceFit
 from skindb.reflectance.reduction import reduce_dictionary
 from skindb.reflectance.tables import brdf_metric, lookup
-from skindb.types import Array, Index
+from skindb.types import Array
 
 ETA = 1.3
 DISC = float(np.radians(0.8))
@@ -45,7 +43,6 @@ TRUTH = (
 SCIPY = "SciPy nnls, precomputed rows, three channels"
 COMPONENTS = 6  # of the planted factorisation
 
-Nodes = tuple[Index, ...]  # indices of nodes of tables
 Predict = Callable[[slice, int], Array]  # surface reflectance of rows of a surfel
 
 
@@ -96,7 +93,8 @@ def _single(values: Array) -> Array:
     return values.astype(np.float32).astype(float)
 
 
-def _unit(v: Array) -> Array:
+def unit(v: Array) -> Array:
+    """Vectors (..., 3) of length one."""
     return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
 
 
@@ -114,10 +112,10 @@ def strip(
     b = 0.9 * (np.arange(surfels) % side) / side - 0.45
     normal = np.stack([np.sin(b), np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)], -1)
     normal += 0.01 * rng.normal(size=normal.shape)
-    normal = _single(_unit(normal))
+    normal = _single(unit(normal))
     position = _single(90 * normal)
-    wi = _unit(light[None] - position[:, None])
-    wo = _unit(camera[None] - position[:, None])
+    wi = unit(light[None] - position[:, None])
+    wo = unit(camera[None] - position[:, None])
     ci = np.einsum("nk,ntk->nt", normal, wi)
     co = np.einsum("nk,ntk->nt", normal, wo)
     seen = (rng.random((surfels, 150, 1)) < 0.85) & (rng.random((surfels, 1, 16)) < 0.8)
@@ -376,86 +374,3 @@ def _by_scikit(X: Array, solver: str, steps: int) -> Array:
         warnings.simplefilter("ignore", ConvergenceWarning)
         model.fit(X)
     return np.asarray(model.components_)
-
-
-def disc_curves(quick: bool) -> list[Curve]:
-    """Averages of tables over the disc of the light, by number of quadrature points."""
-    dictionary = embedded_dictionary()
-    chosen = slice(18, 50, 8)
-    table = np.ascontiguousarray(dictionary.table[..., chosen])
-    names = dictionary.names[chosen]
-    few = Dictionary(names, table, dictionary.grid, dictionary.source)
-    nodes = _random_nodes(150 if quick else 600)
-    exact = _dense_disc(few, nodes, DISC, 100 if quick else 400)
-    convolve_disc(few, DISC, far=(1, 1), near=(1, 1))  # compiles
-    rules = [((1, 4), (1, 4))]
-    if not quick:
-        rules += [(rule, rule) for rule in ((2, 6), (3, 8), (4, 12), (6, 18))]
-    rules.append((FAR_RULE, NEAR_RULE))
-    points = []
-    for far, near in rules:
-        work = partial(convolve_disc, few, DISC, far=far, near=near)
-        seconds, averaged = cpu_time(work)
-        errors = _relative_errors(averaged.table[nodes], exact)
-        details = dict(zip(names, errors.tolist(), strict=True))
-        setting = " and ".join(f"{n} x {m}" for n, m in dict.fromkeys((far, near)))
-        error = float(errors.max())
-        points.append(
-            Point("skindb convolve_disc", setting, seconds, error, "", details)
-        )
-    base = points[-1].name
-    error = float(_relative_errors(table[nodes], exact).max())
-    failure = "a lamp is not a point, so sharp lobes become too high and too narrow"
-    points.append(Point("no convolution", "", np.nan, error, failure))
-    count = len(nodes[0])
-    return [
-        Curve(
-            kernel="disc",
-            error_of=f"relative RMS error at {count} nodes, worst of {len(names)} materials",
-            reference=(
-                "averages of interpolated values over a dense disc around either direction"
-            ),
-            seconds_of=f"{len(names)} tables",
-            base=base,
-            points=points,
-        )
-    ]
-
-
-def _relative_errors(values: Array, exact: Array) -> Array:
-    """RMS errors (materials,) over nodes, over the RMS."""
-    off = np.linalg.norm(values - exact, axis=0)
-    return np.asarray(off / np.linalg.norm(exact, axis=0))
-
-
-def _random_nodes(count: int) -> Nodes:
-    """Indices of random nodes in the lobes, both directions 12 degrees above the horizon."""
-    grid = embedded_dictionary().grid
-    theta_h, theta_d, phi_d = embedded_dictionary().table.shape[:3]
-    rng = np.random.default_rng(5)
-    sizes = (theta_h // 2, theta_d * 2 // 3, phi_d)
-    i, j, k = (rng.integers(0, size, 20 * count) for size in sizes)
-    wi, wo = directions(grid.theta_h[i], grid.theta_d[j], grid.phi_d[k])
-    up = np.flatnonzero(np.minimum(wi[:, 2], wo[:, 2]) > 0.2)[:count]
-    return i[up], j[up], k[up]
-
-
-def _dense_disc(
-    dictionary: Dictionary, nodes: Nodes, angle: float, count: int
-) -> Array:
-    """Means (nodes, materials) over `count` spiral points on the disc around either direction."""
-    grid = dictionary.grid
-    i, j, k = nodes
-    wi, wo = directions(grid.theta_h[i], grid.theta_d[j], grid.phi_d[k])
-    spiral = np.arange(count)
-    radius = np.sqrt((spiral + 0.5) / count) * np.tan(angle)
-    turn = spiral * np.pi * (3 - np.sqrt(5))
-    total = np.zeros((len(i), len(dictionary.names)))
-    for centre, opposite in ((wi, wo), (wo, wi)):
-        x = _unit(np.cross(centre, [0.3, 0.9, 0.1]))
-        y = np.cross(centre, x)
-        for u, v in zip(radius * np.cos(turn), radius * np.sin(turn), strict=True):
-            moved = _unit(centre + u * x + v * y)
-            angles = half_difference(moved, opposite)
-            total += lookup(dictionary.table, *angles) / (2 * count)
-    return total
