@@ -138,7 +138,14 @@ def read_capture(path: str | Path, *, crop: Crop | None = None) -> Capture:
     if data is None:
         raise InputError(faults)
     fields = Fields(data, str(file), faults)
-    _require_version(fields)
+    # require a known format and version; nothing else can be checked without them
+    for key, choices in (("format", (FORMAT,)), ("version", VERSIONS)):
+        value = fields.get(key)
+        if value is not None and (value not in choices or isinstance(value, bool)):
+            rule = f"must be {' or '.join(map(json.dumps, choices))}, which this skindb reads"
+            cure = "update skindb, or write this version"
+            fields.fault(key, rule, shown(value), cure)
+            raise InputError(fields.faults)
     reader = _Reader(folder, fields, crop)
     capture = reader.capture()
     if faults or capture is None:
@@ -154,17 +161,6 @@ def record_faults(record: Mapping[str, Any]) -> list[Fault]:
     fields = Fields(dict(record), "capture.json", [])
     _Reader(Path(), fields, None).person()
     return fields.faults
-
-
-def _require_version(fields: Fields) -> None:
-    """Require a known format and version; nothing else can be checked without them."""
-    for key, choices in (("format", (FORMAT,)), ("version", VERSIONS)):
-        value = fields.get(key)
-        if value is not None and (value not in choices or isinstance(value, bool)):
-            rule = f"must be {' or '.join(map(json.dumps, choices))}, which this skindb reads"
-            cure = "update skindb, or write this version"
-            fields.fault(key, rule, shown(value), cure)
-            raise InputError(fields.faults)
 
 
 class _Reader:

@@ -212,7 +212,16 @@ def _light_pictures(
     schedule: Schedule, dome: Mapping[str, Any], exposure: str, *, lamp: bool
 ) -> dict[str, Picture]:
     """The picture in which each light is measured, above a dark frame if a lamp is on."""
-    viewers = _nearest_cameras(dome)
+    # light -> the camera that sees most of the side that it lights
+    names = [str(camera["id"]) for camera in dome["cameras"]]
+    poses = [
+        (np.array(camera["R"]), np.array(camera["t"])) for camera in dome["cameras"]
+    ]
+    centres = [_unit(-rotation.T @ shift) for rotation, shift in poses]
+    viewers = {}
+    for light in dome["lights"]:
+        cosines = np.stack(centres) @ _unit(light["position"])
+        viewers[str(light["id"])] = names[int(cosines.argmax())]
     background = _dark_steps(schedule).get(exposure, NO_STEP) if lamp else NO_STEP
     pictures = {}
     for i, step in enumerate(schedule.steps):
@@ -261,20 +270,6 @@ def _dark_steps(schedule: Schedule) -> dict[str, int]:
         if step.light == DARK:
             dark.setdefault(step.exposure, i)
     return dark
-
-
-def _nearest_cameras(dome: Mapping[str, Any]) -> dict[str, str]:
-    """Light -> the camera that sees most of the side that it lights."""
-    names = [str(camera["id"]) for camera in dome["cameras"]]
-    poses = [
-        (np.array(camera["R"]), np.array(camera["t"])) for camera in dome["cameras"]
-    ]
-    centres = [_unit(-rotation.T @ shift) for rotation, shift in poses]
-    nearest = {}
-    for light in dome["lights"]:
-        cosines = np.stack(centres) @ _unit(light["position"])
-        nearest[str(light["id"])] = names[int(cosines.argmax())]
-    return nearest
 
 
 def _longest_exposure(dome: Mapping[str, Any]) -> str:

@@ -295,7 +295,14 @@ def _regressions(
             fit = _Regression(
                 rows, columns, adjusted, basis, values[np.ix_(rows, columns)]
             )
-            _require_several(fit)
+            length = np.linalg.norm(fit.regressor)
+            decides = np.abs(fit.regressor) > 1e-6 * length
+            if (decides & (fit.leverage > 1 - 1e-9)).any():
+                # permutations of such a slope are not comparable either
+                raise ValueError(
+                    "each group must have two subjects: the effect depends on one "
+                    "subject and has no error"
+                )
         except ValueError as error:
             fault = error
             continue
@@ -323,18 +330,6 @@ def _adjusted(x: Array, design: Array) -> tuple[Array, Array]:
             "the regressor is the same for all subjects, or a combination of the covariates"
         )
     return residual, basis
-
-
-def _require_several(fit: _Regression) -> None:
-    """Refuse a slope that one subject determines alone: its error is unknown, and
-    permutations are not comparable.
-    """
-    length = np.linalg.norm(fit.regressor)
-    decides = np.abs(fit.regressor) > 1e-6 * length
-    if (decides & (fit.leverage > 1 - 1e-9)).any():
-        raise ValueError(
-            "each group must have two subjects: the effect depends on one subject and has no error"
-        )
 
 
 def _draws(

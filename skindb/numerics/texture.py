@@ -458,15 +458,8 @@ class _Matching:
         ):
             if np.isfinite(target).all():
                 inside = masks[k] > 0
-                ranks = _strictly_increasing(source)
+                span = max(float(source[-1] - source[0]), 1e-12)
+                ranks = source + np.linspace(0, 1e-9 * span, len(source))
                 step = np.interp(part[inside], ranks, target - source)
                 moved[inside] += masks[k][inside] * step
         return part + moved / self.total[k]
-
-
-def _strictly_increasing(values: Float64) -> Float64:
-    """Quantiles made strictly increasing by a negligible slope, so that each value has
-    a unique rank.
-    """
-    span = max(float(values[-1] - values[0]), 1e-12)
-    return values + np.linspace(0, 1e-9 * span, len(values))

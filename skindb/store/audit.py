@@ -242,30 +242,24 @@ def _outcome(place: Place, secret: bytes, number: int) -> AuditEntry | Fault:
     key = entry_key(number)
     try:
         with damage_as_fault(place.where(key), RULE, RESTORE):
-            return _entry_from_json(secret, key, number, place.read_small(key))
+            body = json_object(place.read_small(key))
+            if body.get("number") != number:
+                raise ValueError(f"the entry of number {str(body.get('number'))[:20]}")
+            if not is_sealed(secret, key, body):
+                raise ValueError("content that does not match its seal")
+            if body.pop("format", None) != FORMAT:
+                raise ValueError(
+                    "an entry of another format; if it is of a later version, update skindb"
+                )
+            if body.keys() != TYPES.keys() or not all(
+                isinstance(body[name], kind) for name, kind in TYPES.items()
+            ):
+                raise ValueError("fields that do not match its format")
+            return AuditEntry(**body)
     except UnavailableError:
         raise
     except InputError as error:
         return error.faults[0]
-
-
-def _entry_from_json(
-    secret: bytes, key: str, number: int, content: bytes
-) -> AuditEntry:
-    body = json_object(content)
-    if body.get("number") != number:
-        raise ValueError(f"the entry of number {str(body.get('number'))[:20]}")
-    if not is_sealed(secret, key, body):
-        raise ValueError("content that does not match its seal")
-    if body.pop("format", None) != FORMAT:
-        raise ValueError(
-            "an entry of another format; if it is of a later version, update skindb"
-        )
-    if body.keys() != TYPES.keys() or not all(
-        isinstance(body[name], kind) for name, kind in TYPES.items()
-    ):
-        raise ValueError("fields that do not match its format")
-    return AuditEntry(**body)
 
 
 def _chain_faults(

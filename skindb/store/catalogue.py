@@ -13,7 +13,6 @@ from skindb.schema.cohort import column, few_names, imitates_column, take_coords
 from skindb.schema.consent import CONSENT, consent_scope
 from skindb.store.condition import evaluate, is_missing
 from skindb.store.place import CALIBRATION, RELEASE, STUDY, Located
-from skindb.store.record import Record
 from skindb.store.snapshot import CACHED_KINDS, Lookup, RecordCache
 from skindb.store.stale import DERIVED, Staleness
 
@@ -114,20 +113,19 @@ def _row(lookup: Lookup, take: str) -> dict[str, Any]:
             f"status_{name}": part
             for name, part in model.provenance.get("status", {}).items()
         }
-        row["outdated"] = _is_outdated(model, records.get("capture"))
+        # whether there is a newer capture than that from which a model was made
+        capture = records.get("capture")
+        made_from = [
+            reference["generation"]
+            for reference in model.made_from
+            if reference["kind"] == "capture"
+        ]
+        row["outdated"] = (
+            capture is not None
+            and bool(made_from)
+            and capture.generation not in made_from
+        )
     return row
-
-
-def _is_outdated(model: Record, capture: Record | None) -> bool:
-    """Whether there is a newer capture than that from which a model was made."""
-    made_from = [
-        reference["generation"]
-        for reference in model.made_from
-        if reference["kind"] == "capture"
-    ]
-    return (
-        capture is not None and bool(made_from) and capture.generation not in made_from
-    )
 
 
 def cached_table(lookup: Lookup) -> pd.DataFrame:

@@ -193,7 +193,14 @@ def readable_errors(location: str) -> Iterator[None]:
     """
     from obstore.exceptions import AlreadyExistsError, BaseError
 
-    _require_own_process(location)
+    if not _OBSTORE_PROCESS:
+        _OBSTORE_PROCESS.append(os.getpid())
+    elif _OBSTORE_PROCESS[0] != os.getpid():
+        rule = (
+            "a process that uses a bucket must not be forked from another one that does"
+        )
+        cure = "use the workers of skindb, loky or Dask, or the start method spawn"
+        raise InputError(Fault(location, rule, "a forked process", cure))
     try:
         yield
     except AlreadyExistsError:
@@ -206,20 +213,6 @@ def readable_errors(location: str) -> Iterator[None]:
         if "416 Range" in str(error):
             raise OSError(22, "fewer bytes than were requested", location) from None
         raise _unavailable(location, str(error)) from None
-
-
-def _require_own_process(location: str) -> None:
-    """Raise an `InputError` in a forked process, which has no threads of obstore and
-    would wait forever.
-    """
-    if not _OBSTORE_PROCESS:
-        _OBSTORE_PROCESS.append(os.getpid())
-    elif _OBSTORE_PROCESS[0] != os.getpid():
-        rule = (
-            "a process that uses a bucket must not be forked from another one that does"
-        )
-        cure = "use the workers of skindb, loky or Dask, or the start method spawn"
-        raise InputError(Fault(location, rule, "a forked process", cure))
 
 
 def _unavailable(location: str, text: str) -> UnavailableError:

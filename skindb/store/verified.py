@@ -311,27 +311,23 @@ def metadata_faults(content: bytes, chunks: int) -> str:
         meta = json_object(content)
         if meta.get("node_type") != "array":
             return ""
-        return _array_faults(meta, chunks)
+        dtype = meta["data_type"]
+        if not isinstance(dtype, str) or dtype not in DTYPES:
+            return f"elements of the type {str(dtype)[:80]}"
+        shape = _lengths(meta["shape"])
+        chunk = _lengths(meta["chunk_grid"]["configuration"]["chunk_shape"])
+        if len(shape) != len(chunk) or len(shape) > MAX_DIMS or 0 in chunk:
+            return f"a shape {list(shape)} with chunks {list(chunk)}"
+        if (size := math.prod(chunk) * DTYPES[dtype]) > MAX_CHUNK_BYTES:
+            return f"chunks of {size:.3g} bytes, more than the maximum of {MAX_CHUNK_BYTES:.3g}"
+        promised = math.prod(
+            -(-length // part) for length, part in zip(shape, chunk, strict=True)
+        )
+        if promised != chunks:
+            return f"a shape {list(shape)} with {promised} chunks, but {chunks} chunk files"
+        return _codec_faults(meta["codecs"], depth=0)
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         return f"invalid metadata ({type(error).__name__}: {error})"
-
-
-def _array_faults(meta: dict[str, Any], chunks: int) -> str:
-    dtype = meta["data_type"]
-    if not isinstance(dtype, str) or dtype not in DTYPES:
-        return f"elements of the type {str(dtype)[:80]}"
-    shape = _lengths(meta["shape"])
-    chunk = _lengths(meta["chunk_grid"]["configuration"]["chunk_shape"])
-    if len(shape) != len(chunk) or len(shape) > MAX_DIMS or 0 in chunk:
-        return f"a shape {list(shape)} with chunks {list(chunk)}"
-    if (size := math.prod(chunk) * DTYPES[dtype]) > MAX_CHUNK_BYTES:
-        return f"chunks of {size:.3g} bytes, more than the maximum of {MAX_CHUNK_BYTES:.3g}"
-    promised = math.prod(
-        -(-length // part) for length, part in zip(shape, chunk, strict=True)
-    )
-    if promised != chunks:
-        return f"a shape {list(shape)} with {promised} chunks, but {chunks} chunk files"
-    return _codec_faults(meta["codecs"], depth=0)
 
 
 def _codec_faults(codecs: list[dict[str, Any]], depth: int) -> str:

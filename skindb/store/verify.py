@@ -224,7 +224,16 @@ def version_faults(place: Place, record: Record) -> list[Fault]:
         tables = (
             read_beside(place, record, TABLES, record.tables) if record.tables else b""
         )
-        faults = _file_faults(place, record, manifest)
+        sizes = place.sizes(record.path)
+        names = sorted(sizes.keys() | manifest.keys())
+        with ThreadPoolExecutor(THREADS) as threads:
+            finding = list(
+                threads.map(
+                    lambda name: _file_fault(place, record, manifest, sizes, name),
+                    names,
+                )
+            )
+        faults = [fault for fault in finding if fault is not None]
         return faults or _record_faults(place, record, tables)
     except InputError as error:
         return list(error.faults)
@@ -259,18 +268,6 @@ def _partly_removed_fault(record: Record) -> Fault:
         "both a record and a tombstone",
         "run skindb clean",
     )
-
-
-def _file_faults(place: Place, record: Record, manifest: Manifest) -> list[Fault]:
-    sizes = place.sizes(record.path)
-    names = sorted(sizes.keys() | manifest.keys())
-    with ThreadPoolExecutor(THREADS) as threads:
-        finding = list(
-            threads.map(
-                lambda name: _file_fault(place, record, manifest, sizes, name), names
-            )
-        )
-    return [fault for fault in finding if fault is not None]
 
 
 def _file_fault(

@@ -388,7 +388,14 @@ class _FrameWriter:
         self.sensor = sensor
         self.pattern = pattern
         self.rng = rng
-        self.gain = _vignette(camera)
+        # loss of light (h, w, 1) towards the corners, 1 at the principal point
+        y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+        half = np.hypot(camera.width, camera.height) / 2
+        r2 = ((x - camera.matrix[0, 2]) ** 2 + (y - camera.matrix[1, 2]) ** 2) / half**2
+        a2, a4, a6 = camera.vignette
+        self.gain = np.asarray(1 + r2 * (a2 + r2 * (a4 + r2 * a6)), np.float32)[
+            ..., None
+        ]
 
     def write(
         self, template: str, light: str, radiance: Image, *, averaged: int = 1
@@ -428,15 +435,6 @@ def frontal_camera(dome: Dome) -> DomeCamera:
             (c.position - CENTRE)[2] / np.linalg.norm(c.position - CENTRE)
         ),
     )
-
-
-def _vignette(camera: DomeCamera) -> Image:
-    """Loss of light (h, w, 1) towards the corners, 1 at the principal point."""
-    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    half = np.hypot(camera.width, camera.height) / 2
-    r2 = ((x - camera.matrix[0, 2]) ** 2 + (y - camera.matrix[1, 2]) ** 2) / half**2
-    a2, a4, a6 = camera.vignette
-    return np.asarray(1 + r2 * (a2 + r2 * (a4 + r2 * a6)), np.float32)[..., None]
 
 
 def _target_radiances(
