@@ -119,12 +119,17 @@ class InputError(ValueError):
         return InputError, (self.faults,)
 
 
+def input_error(where: str, rule: str, found: str, cure: str = "") -> InputError:
+    """An `InputError` with one fault."""
+    return InputError(Fault(where, rule, found, cure))
+
+
 def require(
     satisfied: object, where: str, rule: str, found: str, cure: str = ""
 ) -> None:
     """Raise an `InputError` with one fault unless a condition is satisfied."""
     if not satisfied:
-        raise InputError(Fault(where, rule, found, cure))
+        raise input_error(where, rule, found, cure)
 
 
 def attempt(

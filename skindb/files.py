@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 
 PRIVATE = 0o700  # permissions of folders with personal data
 PRIVATE_FILE = 0o600  # and of files
@@ -54,16 +54,20 @@ def open_regular(path: Path, max_bytes: int) -> BufferedReader:
     except OSError as error:
         raise _not_opened(path, error) from None
     except ValueError as error:  # a zero byte or an unpaired surrogate in the name
-        rule = "the file must exist"
-        raise InputError(Fault(where, rule, str(error), "correct its name")) from None
+        raise input_error(
+            where, "the file must exist", str(error), "correct its name"
+        ) from None
     try:
         status = os.fstat(number)
         if not stat.S_ISREG(status.st_mode):
             raise _of_kind(where, status.st_mode)
         if status.st_size > max_bytes:
-            rule = f"the file must be at most {_size(max_bytes)}"
-            cure = "check that it is the right file, or make it smaller"
-            raise InputError(Fault(where, rule, _size(status.st_size), cure))
+            raise input_error(
+                where,
+                f"the file must be at most {_size(max_bytes)}",
+                _size(status.st_size),
+                "check that it is the right file, or make it smaller",
+            )
         # keeps the name, which readers of TIFF use
         return open(path, "rb", opener=lambda *_: number)
     except BaseException:

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Self, Union, get_args, get_origin, get_type_hints
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 from skindb.limits import (
     MAX_CAMERAS,
     MAX_DEMO_TAKES,
@@ -391,13 +391,11 @@ def require_sizes(lights: int, cameras: int, width: int, height: int) -> None:
         ("width x height", width * height, MAX_VIRTUAL_PIXELS),
     ):
         if not 1 <= size <= most:
-            raise InputError(
-                Fault(
-                    "virtual dome",
-                    f"{what} must be 1 to {most:,}",
-                    f"{size:,}",
-                    "choose another number",
-                )
+            raise input_error(
+                "virtual dome",
+                f"{what} must be 1 to {most:,}",
+                f"{size:,}",
+                "choose another number",
             )
 
 

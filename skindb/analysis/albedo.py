@@ -24,7 +24,7 @@ from skindb.analysis.study import (
 )
 from skindb.analysis.subjects import groups_by, level_error, takes_to_compare
 from skindb.analysis.summary import SAMPLED
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error, require
 from skindb.numerics.statistics import Moments
 from skindb.parameters import group_option
 from skindb.schema import dataset, variables
@@ -146,14 +146,11 @@ def _colours(take: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
     )
     if not good.any():
         name_of_take = str(take["take"].values)
-        cure = "skip the take or fit it again"
-        raise InputError(
-            Fault(
-                name_of_take,
-                "a take of a population must have fitted surfels",
-                "none",
-                cure,
-            )
+        raise input_error(
+            name_of_take,
+            "a take of a population must have fitted surfels",
+            "none",
+            "skip the take or fit it again",
         )
     stored = _masks(take, good)
     name = take["take"].values.item()
@@ -164,10 +161,13 @@ def _colours(take: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
             registered[variables.SURFEL_INDEX].values[: len(good)][good],
             take[variables.SURFEL_INDEX].values[good],
         )
-        if not same:
-            rule = "regions by landmarks must belong to the sampled surfels"
-            cure = "open both cohorts with the same seed"
-            raise InputError(Fault(str(name), rule, "a different sample", cure))
+        require(
+            same,
+            str(name),
+            "regions by landmarks must belong to the sampled surfels",
+            "a different sample",
+            "open both cohorts with the same seed",
+        )
         by_landmark = _masks(registered, good)
     by_landmarks = frozenset(region for region in by_landmark if region not in stored)
     colour = take[variables.DIFFUSE_REFLECTANCE].values[good].astype(float)

@@ -25,7 +25,7 @@ from skindb.analysis.study import (
     shared_once,
     skipped_takes,
 )
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 from skindb.numerics.factorise import Sums, nmf, refine
 from skindb.numerics.nnls import solve_nnls
 from skindb.numerics.statistics import bootstrap_interval
@@ -227,14 +227,11 @@ def same_dictionary(cohort: xr.Dataset) -> list[str]:
             {str(value) for value in cohort["fit_dictionary"].dropna("take").values}
         )
         if len(sources) > 1:
-            rule = "all takes of a population must be fitted with one dictionary"
-            raise InputError(
-                Fault(
-                    "dictionary",
-                    rule,
-                    ", ".join(sources),
-                    "fit them again with the same dictionary",
-                )
+            raise input_error(
+                "dictionary",
+                "all takes of a population must be fitted with one dictionary",
+                ", ".join(sources),
+                "fit them again with the same dictionary",
             )
     return [str(name) for name in cohort["dictionary"].values]
 

@@ -35,7 +35,7 @@ from skindb.analysis.study import (
 )
 from skindb.analysis.subjects import groups_by, takes_to_compare
 from skindb.analysis.texture import COVERED, DARKEST, LEAST_COVERED, MAPPED
-from skindb.errors import Fault, InputError
+from skindb.errors import InputError, input_error, require
 from skindb.numerics.statistics import Moments, known_mean
 from skindb.parameters import group_option, seed_option
 from skindb.schema import dataset, variables
@@ -210,15 +210,21 @@ def _skin_samples(cohort: xr.Dataset, inside: Mask, count: int) -> list[_Sampled
         for sample in each_take(_sampled, cohort, MAPPED, inside, count)
         if sample is not None
     ]
-    if not samples:
-        rule = "some texels of skin must be measured"
-        cure = "fit or register more takes"
-        raise InputError(Fault("chromophores", rule, "none", cure))
+    require(
+        samples,
+        "chromophores",
+        "some texels of skin must be measured",
+        "none",
+        "fit or register more takes",
+    )
     density = np.concatenate([sample.density for sample in samples])
     if density.var(axis=0).sum() <= CONSTANT:
-        rule = "albedo must vary over the skin of a take"
-        cure = "use maps of measured faces"
-        raise InputError(Fault("chromophores", rule, "constant maps", cure))
+        raise input_error(
+            "chromophores",
+            "albedo must vary over the skin of a take",
+            "constant maps",
+            "use maps of measured faces",
+        )
     return samples
 
 

@@ -21,7 +21,7 @@ from skindb.analysis.study import (
 )
 from skindb.analysis.subjects import takes_to_compare
 from skindb.analysis.texture import COVERED
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error, require
 from skindb.numerics.factorise import principal_axes
 from skindb.numerics.statistics import Moments, known_mean
 from skindb.parameters import option
@@ -110,12 +110,13 @@ def mean_face(
         )
         count = moments.count.min(axis=-1) if moments.count.ndim == 3 else moments.count
         maps[f"{short}_count"] = count.astype(np.int32)
-    if not any(np.isfinite(maps[AVERAGED[name][0]]).any() for name in names):
-        rule = f"at least one texel must be measured in {min_subjects} subjects"
-        cure = "fit or register more subjects"
-        raise InputError(
-            Fault("mean face", rule, f"none among {len(subjects.names)} subjects", cure)
-        )
+    require(
+        any(np.isfinite(maps[AVERAGED[name][0]]).any() for name in names),
+        "mean face",
+        f"at least one texel must be measured in {min_subjects} subjects",
+        f"none among {len(subjects.names)} subjects",
+        "fit or register more subjects",
+    )
     return dataset(
         maps,
         coords={"channel": ["R", "G", "B"]},
@@ -263,17 +264,20 @@ def _usable_entries(
         if i not in rows
     ]
     if len(rows) < 2:
-        rule = "at least two takes must have enough values"
-        finding = f"{len(rows)} of {len(finite)}"
-        raise InputError(
-            Fault("principal components", rule, finding, "fit or register more takes")
+        raise input_error(
+            "principal components",
+            "at least two takes must have enough values",
+            f"{len(rows)} of {len(finite)}",
+            "fit or register more takes",
         )
     is_used: Mask = np.logical_and.reduce([finite[i] for i in rows])
-    if not is_used.any():
-        rule = "some entries must be known in every take"
-        finding = f"none of {is_used.size}"
-        cure = "set a larger least_known to exclude takes that cover other parts"
-        raise InputError(Fault("principal components", rule, finding, cure))
+    require(
+        is_used.any(),
+        "principal components",
+        "some entries must be known in every take",
+        f"none of {is_used.size}",
+        "set a larger least_known to exclude takes that cover other parts",
+    )
     return rows, is_used, skipped
 
 

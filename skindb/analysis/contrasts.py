@@ -30,7 +30,7 @@ from skindb.analysis.subjects import (
     trait_of,
     word_of,
 )
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, input_error, require
 from skindb.numerics.inference import (
     Effects,
     effects,
@@ -148,11 +148,13 @@ def quantities_of(cohort: xr.Dataset) -> Quantities:
                 columns.append(column)
                 is_log.append(logarithmic)
                 common.append(half_width if is_albedo else 0.0)
-    if not names:
-        rule = "some take must have albedo, surface reflectance or sigma_tr"
-        raise InputError(
-            Fault("population", rule, "none of them", "fit the takes again")
-        )
+    require(
+        names,
+        "population",
+        "some take must have albedo, surface reflectance or sigma_tr",
+        "none of them",
+        "fit the takes again",
+    )
     subject = tuple(map(str, cohort["subject"].values))
     stacked = np.stack(columns, axis=1)
     return Quantities(
@@ -213,9 +215,11 @@ def contrasts(
     compared = attribute_of(everyone, group_by)
     if compared == CONDITION:
         if adjust:
-            rule = "conditions are compared within subjects, which holds everything else fixed"
-            raise InputError(
-                Fault("adjust", rule, ", ".join(adjust), "omit this option")
+            raise input_error(
+                "adjust",
+                "conditions are compared within subjects, which holds everything else fixed",
+                ", ".join(adjust),
+                "omit this option",
             )
         return _paired(cohort, group_by, measure)
     require_adjustable(everyone, adjust, compared)
@@ -261,9 +265,11 @@ def _regressors(attribute: Attribute, group_by: str) -> dict[str, Array]:
     words = sorted({word_of(value) for value in attribute.known})
     if len(words) < 2:
         finding = f"only {words[0]}" if words else "no subject with this attribute"
-        rule = "there must be subjects of two groups"
-        raise InputError(
-            Fault(f"group by {group_by}", rule, finding, "group by another attribute")
+        raise input_error(
+            f"group by {group_by}",
+            "there must be subjects of two groups",
+            finding,
+            "group by another attribute",
         )
     if attribute.is_numeric:
         return {f"{group_by}, per unit": attribute.numbers}
@@ -350,10 +356,13 @@ def _paired(
         nothing = np.empty((len(both), 0))
         title = f"{name} less {NORMAL}"
         pairs.append(Contrast(title, difference, ones, nothing, before=before))
-    if not pairs:
-        rule = "some subjects must be measured in both conditions"
-        cure = "measure subjects in two conditions"
-        raise InputError(Fault(f"group by {group_by}", rule, "none", cure))
+    require(
+        pairs,
+        f"group by {group_by}",
+        "some subjects must be measured in both conditions",
+        "none",
+        "measure subjects in two conditions",
+    )
     return pairs
 
 

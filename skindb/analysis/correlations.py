@@ -21,7 +21,7 @@ from skindb.analysis.study import (
     table_of,
 )
 from skindb.analysis.subjects import takes_to_compare
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error, require
 from skindb.numerics.statistics import benjamini_hochberg, known_mean
 from skindb.parameters import permutations_option, seed_option
 from skindb.schema import dataset, variables
@@ -105,10 +105,13 @@ def component_correlations(
         for pair in combinations(range(len(COMPONENTS)), 2)
         if _can_correlate(values[:, pair])
     ]
-    if not pairs:
-        rule = f"at least {MIN_SUBJECTS} subjects must have two components that vary"
-        cure = "fit more subjects"
-        raise InputError(Fault("correlations", rule, f"{len(values)} subjects", cure))
+    require(
+        pairs,
+        "correlations",
+        f"at least {MIN_SUBJECTS} subjects must have two components that vary",
+        f"{len(values)} subjects",
+        "fit more subjects",
+    )
     rows = [_pair(values[:, [i, j]], permutations, rng) for i, j in pairs]
     values_of_pairs, low, high, p, count = (
         np.array(column) for column in zip(*rows, strict=True)
@@ -162,9 +165,12 @@ def _components(quantities: Quantities, region: str) -> Array:
 def _require_region(takes: xr.Dataset, region: str) -> None:
     """Raise `InputError` if no take has a region of this name."""
     if "region" in takes.coords and region not in takes["region"].values:
-        rule = "must be a region of the takes"
-        cure = f"choose one of {', '.join(map(str, takes['region'].values))}"
-        raise InputError(Fault(f"region {region}", rule, "an unknown name", cure))
+        raise input_error(
+            f"region {region}",
+            "must be a region of the takes",
+            "an unknown name",
+            f"choose one of {', '.join(map(str, takes['region'].values))}",
+        )
 
 
 def _can_correlate(columns: Array) -> bool:

@@ -24,7 +24,7 @@ from skindb.analysis.subjects import (
     multiple_correlation,
     subjects_of,
 )
-from skindb.errors import Fault, InputError
+from skindb.errors import require
 from skindb.schema import IDENTIFIED, dataset, variables
 from skindb.schema.cohort import require_takes
 from skindb.types import Array
@@ -77,10 +77,13 @@ def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
         If the cohort has no take.
     """
     require_takes(cohort, "tables")
-    if not cohort.sizes["take"]:
-        raise InputError(
-            Fault("coverage", "the cohort must have a take", "none", "fit a take first")
-        )
+    require(
+        cohort.sizes["take"],
+        "coverage",
+        "the cohort must have a take",
+        "none",
+        "fit a take first",
+    )
     takes = subjects_of(cohort)
     subjects = takes.names
     stated = {

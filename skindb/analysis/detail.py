@@ -14,7 +14,7 @@ from skindb.analysis.edit import surviving, with_albedo
 from skindb.analysis.regions import common_landmarks, map_regions
 from skindb.analysis.summary import common_maps
 from skindb.analysis.texture import SIZE, at_surfels, log_albedo
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error, require
 from skindb.numerics.texture import Image, build, level_fractions, reconstruct
 from skindb.schema import variables
 from skindb.schema.consent import honour_consent
@@ -111,12 +111,13 @@ def transfer_detail(
 
 def _require_same_landmarks(registered: xr.Dataset, source: xr.Dataset) -> None:
     """Raise `InputError` if two takes were not registered together."""
-    if not np.array_equal(registered["landmark"].values, source["landmark"].values):
-        rule = "both takes must be registered together"
-        finding = "different sets of landmarks"
-        raise InputError(
-            Fault("transfer of detail", rule, finding, "run skindb register")
-        )
+    require(
+        np.array_equal(registered["landmark"].values, source["landmark"].values),
+        "transfer of detail",
+        "both takes must be registered together",
+        "different sets of landmarks",
+        "run skindb register",
+    )
 
 
 def _transferred_levels(coarsest: float, per_texel: float, size: int) -> int:
@@ -130,9 +131,12 @@ def _transferred_levels(coarsest: float, per_texel: float, size: int) -> int:
     levels = math.floor(math.log2(coarsest / per_texel)) - 1 if coarsest > 0 else 0
     levels = min(levels, size.bit_length() - 2)
     if levels < 1:
-        rule = f"must be at least four texels of {per_texel:.2g} mm"
-        cure = "choose a larger wavelength or more texels"
-        raise InputError(Fault("coarsest", rule, f"{coarsest:g} mm", cure))
+        raise input_error(
+            "coarsest",
+            f"must be at least four texels of {per_texel:.2g} mm",
+            f"{coarsest:g} mm",
+            "choose a larger wavelength or more texels",
+        )
     return levels
 
 
@@ -158,21 +162,21 @@ def _region(
 ) -> Mask:
     if not isinstance(region, str):
         mask = np.asarray(region, bool)
-        if mask.shape != (size, size):
-            rule = f"a mask must have ({size}, {size}) texels"
-            cure = "pass a mask of that shape, or another size"
-            raise InputError(Fault("region", rule, str(mask.shape), cure))
+        require(
+            mask.shape == (size, size),
+            "region",
+            f"a mask must have ({size}, {size}) texels",
+            str(mask.shape),
+            "pass a mask of that shape, or another size",
+        )
         return mask
     landmarks = common_landmarks({"own": registered, "other": source_registered})
     drawn = map_regions(landmarks, size)
     if region not in drawn:
-        cure = f"choose one of {', '.join(drawn)}"
-        raise InputError(
-            Fault(
-                f"region {region}",
-                "must be a region defined by the landmarks",
-                "an unknown name",
-                cure,
-            )
+        raise input_error(
+            f"region {region}",
+            "must be a region defined by the landmarks",
+            "an unknown name",
+            f"choose one of {', '.join(drawn)}",
         )
     return drawn[region]

@@ -13,7 +13,7 @@ from skindb.analysis.albedo import cumulative, decorrelate, histogram, levels, q
 from skindb.analysis.brdf import project
 from skindb.analysis.subjects import trait_name
 from skindb.analysis.texture import at_surfels, edit_texture
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 from skindb.numerics.texture import valid_quantiles
 from skindb.optics.diffusion import dipole_s
 from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, stored_brdf
@@ -176,18 +176,18 @@ def _trait_amounts(amounts: Mapping[str, float], traits: xr.Dataset) -> Array:
     if faults:
         raise InputError(faults)
     if not np.isfinite(total).all():
-        raise InputError(
-            Fault(
-                "amount",
-                "must be a finite number",
-                str(dict(amounts)),
-                "give a number such as 0.5",
-            )
+        raise input_error(
+            "amount",
+            "must be a finite number",
+            str(dict(amounts)),
+            "give a number such as 0.5",
         )
     if np.abs(total).max(initial=0.0) > MAX_AMOUNT:
-        rule = f"must be between -{MAX_AMOUNT:g} and {MAX_AMOUNT:g}; 1 is the whole difference"
-        raise InputError(
-            Fault("amount", rule, str(dict(amounts)), "give a number such as 0.5")
+        raise input_error(
+            "amount",
+            f"must be between -{MAX_AMOUNT:g} and {MAX_AMOUNT:g}; 1 is the whole difference",
+            str(dict(amounts)),
+            "give a number such as 0.5",
         )
     return total
 

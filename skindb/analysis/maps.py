@@ -30,7 +30,7 @@ from skindb.analysis.study import (
     skipped_takes,
 )
 from skindb.analysis.subjects import notes_on_attributes, subjects_of
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 from skindb.parameters import ContrastParameters, permutations_option
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit, require_takes
@@ -199,9 +199,12 @@ def _variable_maps(
 def _require_divisor(size: int, texels: int) -> None:
     """Raise `InputError` if maps of `texels` cannot be averaged to `size` texels."""
     if size < 1 or texels % size:
-        rule = f"must divide the {texels} texels of the maps"
-        cure = f"choose {texels}, {texels // 2} or {texels // 4}"
-        raise InputError(Fault("size", rule, str(size), cure))
+        raise input_error(
+            "size",
+            f"must divide the {texels} texels of the maps",
+            str(size),
+            f"choose {texels}, {texels // 2} or {texels // 4}",
+        )
 
 
 def _texel_quantities(takes: xr.Dataset, *, variable: str, size: int) -> Quantities:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.geometry.atlas import signed_areas
 from skindb.geometry.landmarks import mean_shape
 from skindb.geometry.mesh import closest_on_mesh
@@ -172,15 +172,11 @@ def common_frame(
     """
     if reference is not None and reference not in outlines:
         choices = ", ".join(outlines) or "none"
-        rule = "must be a take with landmarks"
-        finding = "another name"
-        raise InputError(
-            Fault(
-                f"reference {reference}",
-                rule,
-                finding,
-                f"choose from takes with landmarks: {choices}",
-            )
+        raise input_error(
+            f"reference {reference}",
+            "must be a take with landmarks",
+            "another name",
+            f"choose from takes with landmarks: {choices}",
         )
     if not outlines:
         return None

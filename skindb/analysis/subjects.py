@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 from skindb.schema.notes import Note, note
 from skindb.types import Array, Mask
 
@@ -87,10 +87,12 @@ class Attribute:
     def require_one_kind(self) -> None:
         """Raise `InputError` if some values are numbers and others are words."""
         if words := self.odd_words:
-            rule = "must be a number for all subjects or a word for all"
-            finding = f"numbers and {', '.join(map(repr, words[:3]))}"
-            cure = "correct the traits in capture.json and ingest again"
-            raise InputError(Fault(f"attribute {self.name}", rule, finding, cure))
+            raise input_error(
+                f"attribute {self.name}",
+                "must be a number for all subjects or a word for all",
+                f"numbers and {', '.join(map(repr, words[:3]))}",
+                "correct the traits in capture.json and ingest again",
+            )
 
     def notes(self) -> list[str]:
         """Lines about values that are likely to be mistakes."""
@@ -201,10 +203,12 @@ def takes_to_compare(
     compared = group_by is not None and attribute_of(subjects, group_by) == CONDITION
     rows = np.flatnonzero(subjects.is_normal | compared)
     if not rows.size:
-        rule = "groups must have a take in the condition normal"
-        finding = f"only {', '.join(subjects.take)}"
-        cure = "group by condition, or add takes in the condition normal"
-        raise InputError(Fault("population", rule, finding, cure))
+        raise input_error(
+            "population",
+            "groups must have a take in the condition normal",
+            f"only {', '.join(subjects.take)}",
+            "group by condition, or add takes in the condition normal",
+        )
     return cohort.isel(take=rows), subjects.select(rows)
 
 
@@ -265,8 +269,9 @@ def trait_of(subjects: Subjects, name: str) -> str:
             f"traits: {', '.join(traits) or 'none'}"
         )
         finding = error.faults[0].found
-        rule = "must be an attribute or a trait"
-        raise InputError(Fault(f"group by {name}", rule, finding, cure)) from None
+        raise input_error(
+            f"group by {name}", "must be an attribute or a trait", finding, cure
+        ) from None
 
 
 def trait_name(name: str, candidates: Iterable[str]) -> str:
@@ -288,8 +293,9 @@ def trait_name(name: str, candidates: Iterable[str]) -> str:
     finding = (
         f"{len(meant)} matches: {', '.join(meant)}" if meant else "an unknown name"
     )
-    cure = f"choose from: {', '.join(traits) or 'none'}"
-    raise InputError(Fault(f"trait {name}", rule, finding, cure))
+    raise input_error(
+        f"trait {name}", rule, finding, f"choose from: {', '.join(traits) or 'none'}"
+    )
 
 
 def known_traits(subjects: Subjects) -> list[str]:

@@ -12,7 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.analysis.regions import own_masks
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, require
 from skindb.geometry.atlas import atlas_values, push_pull, rasterise_atlas
 from skindb.render.surfels import surfel_texels, texel_codes
 from skindb.schema import FitStatus, TexelStatus, Use, dataset, names_of, variables
@@ -328,17 +328,13 @@ def cohort_of(
         for take, model in models.items()
         if "statistics" in consent_scope(model.attrs)
     }
-    if not allowed:
-        finding = f"none of {len(models)} takes"
-        cure = "see consent.scope in capture.json"
-        raise InputError(
-            Fault(
-                "population",
-                "the consent of a take must cover statistics",
-                finding,
-                cure,
-            )
-        )
+    require(
+        allowed,
+        "population",
+        "the consent of a take must cover statistics",
+        f"none of {len(models)} takes",
+        "see consent.scope in capture.json",
+    )
     skipped = [
         note(take, "its consent does not cover statistics")
         for take in models

@@ -31,7 +31,7 @@ from skindb.analysis.subjects import (
     takes_to_compare,
 )
 from skindb.analysis.summary import SAMPLED
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error, require
 from skindb.numerics.inference import (
     between_groups_p,
     classical_scaling,
@@ -201,10 +201,13 @@ def brdf_space(
 
 def _require_different(distance: Array, group_by: str) -> None:
     """Raise `InputError` if all distances (take, take) are 0 or, without a mean, NaN."""
-    if not distance.max() > IDENTICAL:
-        rule = "the BRDFs of takes must differ"
-        finding = "the same BRDF in all takes"
-        raise InputError(Fault(f"group by {group_by}", rule, finding, "check the fits"))
+    require(
+        distance.max() > IDENTICAL,
+        f"group by {group_by}",
+        "the BRDFs of takes must differ",
+        "the same BRDF in all takes",
+        "check the fits",
+    )
 
 
 def grouped_takes(
@@ -223,13 +226,8 @@ def grouped_takes(
             if group_by == "age"
             else "group by another attribute"
         )
-        raise InputError(
-            Fault(
-                f"group by {group_by}",
-                "must not be numeric",
-                "a numeric attribute",
-                cure,
-            )
+        raise input_error(
+            f"group by {group_by}", "must not be numeric", "a numeric attribute", cure
         )
     _, counted = takes_to_compare(cohort, group_by)
     named = groups_by(counted, group_by)
@@ -237,20 +235,19 @@ def grouped_takes(
     groups = sorted({named[i] for i in rows})
     if len(groups) < 2:
         finding = f"only {groups[0]}" if groups else "no take with this attribute"
-        rule = "there must be subjects of two groups"
-        raise InputError(
-            Fault(f"group by {group_by}", rule, finding, "group by another attribute")
+        raise input_error(
+            f"group by {group_by}",
+            "there must be subjects of two groups",
+            finding,
+            "group by another attribute",
         )
     subjects = counted.select(rows)
     if len(subjects.names) < 2:
-        cure = "add the takes of other subjects"
-        raise InputError(
-            Fault(
-                f"group by {group_by}",
-                "there must be at least two subjects",
-                "one",
-                cure,
-            )
+        raise input_error(
+            f"group by {group_by}",
+            "there must be at least two subjects",
+            "one",
+            "add the takes of other subjects",
         )
     excluded = len(named) - len(rows)
     flags = (
@@ -275,14 +272,11 @@ def _coefficients(names: Sequence[str], basis: xr.Dataset) -> Array:
     )
     rank = int((values > INDEPENDENT * values[0]).sum())
     if rank < len(mixture):
-        finding = f"{len(mixture)} components of rank {rank}"
-        raise InputError(
-            Fault(
-                "basis",
-                "the components must be linearly independent",
-                finding,
-                "choose a smaller k",
-            )
+        raise input_error(
+            "basis",
+            "the components must be linearly independent",
+            f"{len(mixture)} components of rank {rank}",
+            "choose a smaller k",
         )
     row_of = {str(take): i for i, take in enumerate(basis["take"].values)}
     stored = basis[variables.TAKE_COEFFICIENT].values.astype(float)
@@ -493,9 +487,11 @@ def compute(population: Population, parameters: Parameters) -> Results:
     )
     rank = basis.sizes["component"]
     if rank < k:
-        rule = "must not be above the number of BRDFs of the dictionary or of surfels"
-        raise InputError(
-            Fault("k", rule, f"{k}, and {rank} of them", "choose a smaller k")
+        raise input_error(
+            "k",
+            "must not be above the number of BRDFs of the dictionary or of surfels",
+            f"{k}, and {rank} of them",
+            "choose a smaller k",
         )
     space = brdf_space(
         cohort,

@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter
 from skindb.analysis.regions import map_regions
 from skindb.analysis.study import each_take, skipped_takes
 from skindb.elementwise import thread_count
-from skindb.errors import Fault, InputError
+from skindb.errors import require
 from skindb.geometry.atlas import bilinear, push_pull
 from skindb.numerics.factorise import principal_axes
 from skindb.numerics.texture import (
@@ -112,12 +112,13 @@ def texture_statistics(
     drawn = np.stack([masks[name] for name in names])
     mean, axes = _axes(each_take(_moments, cohort, MAPPED))
     distributions = each_take(_distributions, cohort, MAPPED, drawn, mean, axes)
-    if not np.isfinite(np.stack([row[0] for row in distributions])).any():
-        rule = "at least one take must have measured half of a region"
-        cure = "fit or register more takes"
-        raise InputError(
-            Fault("texture", rule, f"none of {len(distributions)} takes", cure)
-        )
+    require(
+        np.isfinite(np.stack([row[0] for row in distributions])).any(),
+        "texture",
+        "at least one take must have measured half of a region",
+        f"none of {len(distributions)} takes",
+        "fit or register more takes",
+    )
     quantiles, low, high, covered = (
         np.stack(column) for column in zip(*distributions, strict=True)
     )
@@ -174,15 +175,13 @@ def _moments(maps: xr.Dataset) -> Moments | None:
 def _axes(moments: list[Moments | None]) -> tuple[Array, Array]:
     """Common mean (3,) and axes (3, 3) in rows; the variance includes differences between takes."""
     measured = [take for take in moments if take is not None]
-    if not measured:
-        raise InputError(
-            Fault(
-                "texture",
-                "some texels must be measured",
-                "none",
-                "fit or register more takes",
-            )
-        )
+    require(
+        measured,
+        "texture",
+        "some texels must be measured",
+        "none",
+        "fit or register more takes",
+    )
     return colour_axes(
         [take.mean for take in measured], [take.scatter for take in measured]
     )

@@ -35,7 +35,7 @@ from skindb.analysis.subjects import (
     trait_names,
 )
 from skindb.analysis.summary import SAMPLED
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 from skindb.numerics.inference import missing_patterns
 from skindb.numerics.statistics import known_mean
 from skindb.parameters import DICTIONARY_HELP, adjust_option, option, seed_option
@@ -326,8 +326,12 @@ def _units(
     if np.linalg.matrix_rank(design) < np.linalg.matrix_rank(design[:, 1:]) + 1:
         rule = "must vary independently of the attributes that are adjusted for"
         finding = ", ".join(adjust) or "one value"
-        cure = "adjust for fewer attributes, or exclude the trait"
-        raise InputError(Fault(f"trait {trait}", rule, finding, cure))
+        raise input_error(
+            f"trait {trait}",
+            rule,
+            finding,
+            "adjust for fewer attributes, or exclude the trait",
+        )
     return Units(
         tuple(
             rows

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from skindb.bench.curve import Curve, Point, cpu_time
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.fit.translucency import MODELS, ProbeFit, fit_profile
 from skindb.optics.diffusion import (
     S_MAX,
@@ -125,9 +125,11 @@ def require_mpmath() -> Any:
     try:
         import mpmath
     except ImportError:
-        cure = "pip install 'skindb[bench]', or choose other kernels with --only"
-        raise InputError(
-            Fault("bench inverse", "mpmath must be installed", "no module mpmath", cure)
+        raise input_error(
+            "bench inverse",
+            "mpmath must be installed",
+            "no module mpmath",
+            "pip install 'skindb[bench]', or choose other kernels with --only",
         ) from None
     return mpmath
 

@@ -27,7 +27,7 @@ from skindb.calibration.irradiance import (
 )
 from skindb.calibration.radiance import FrameMerger, frame_mergers
 from skindb.calibration.setup import PLACE, BallFrames, of_devices
-from skindb.errors import Fault, InputError, attempt, attempt_all, require
+from skindb.errors import Fault, InputError, attempt, attempt_all, input_error, require
 from skindb.format.dome import (
     CameraRecord,
     DomeRecord,
@@ -360,8 +360,9 @@ def calibrate_lights(
     """
     white = dome.white
     if white is None:
-        rule = "a calibration needs one"
-        raise InputError(Fault("white target", rule, "none", "photograph it"))
+        raise input_error(
+            "white target", "a calibration needs one", "none", "photograph it"
+        )
     faults = list[Fault]()
     mergers = frame_mergers(dome, faults)
     views = [

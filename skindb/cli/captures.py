@@ -32,7 +32,7 @@ from skindb.cli.shared import (
     summary_of,
 )
 from skindb.cli.terminal import bar, echo
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.limits import MAX_COHORT, MAX_DEMO_TAKES
 from skindb.parameters import (
     CONDITIONS,
@@ -111,13 +111,11 @@ def simulate(
     """
     progress = bar()
     if conditions and cohort is None:
-        raise InputError(
-            Fault(
-                "--condition",
-                "belongs to a cohort",
-                "no --cohort",
-                "give the number of subjects",
-            )
+        raise input_error(
+            "--condition",
+            "belongs to a cohort",
+            "no --cohort",
+            "give the number of subjects",
         )
     people = (
         None
@@ -190,10 +188,11 @@ def ingest(
     unless --new-consent states a new consent.
     """
     if new_consent is not None and len(captures) > 1:
-        rule = "a new consent is stated for one capture"
-        cure = "ingest one capture with it, and then the others"
-        raise InputError(
-            Fault("--new-consent", rule, f"{len(captures)} captures", cure)
+        raise input_error(
+            "--new-consent",
+            "a new consent is stated for one capture",
+            f"{len(captures)} captures",
+            "ingest one capture with it, and then the others",
         )
     low, high = (crop_box[:3], crop_box[3:]) if crop_box else (None, None)
     crop = skindb.ingest.Crop(low, high, crop_reach) if crop_box or crop_reach else None

@@ -35,7 +35,7 @@ from skindb.cli.shared import (
     writable,
 )
 from skindb.cli.terminal import bar
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error, require
 from skindb.parameters import (
     ComparisonParameters,
     ExportParameters,
@@ -244,10 +244,11 @@ def export(
         writable(out, ".glb")
         require_one_take(out, chosen)
     elif out.suffix in (".glb", ".gltf"):
-        rule = "without --gltf it must be a folder, which gets a bundle for each take"
-        cure = "add --gltf, or rename it"
-        raise InputError(
-            Fault(str(out), rule, f"a name that ends in {out.suffix}", cure)
+        raise input_error(
+            str(out),
+            "without --gltf it must be a folder, which gets a bundle for each take",
+            f"a name that ends in {out.suffix}",
+            "add --gltf, or rename it",
         )
     options = {"edited": edited, "generation": generation, **vars(parameters)}
     call = partial(
@@ -309,9 +310,13 @@ def view(
     the server.
     """
     amounts = trait_amounts(parameters.traits, default=1.0)
-    if 0.0 in amounts.values():
-        rule = "the amount at the end of a slider must not be 0"
-        raise InputError(Fault("--trait", rule, "0", "give, for example, age=20"))
+    require(
+        0.0 not in amounts.values(),
+        "--trait",
+        "the amount at the end of a slider must not be 0",
+        "0",
+        "give, for example, age=20",
+    )
     database = existing(db)
     chosen = chosen_takes(database, takes, "model")
     if explain:

@@ -22,7 +22,7 @@ from click.core import ParameterSource
 import skindb
 from skindb.cli.options import asked
 from skindb.cli.terminal import Progress, echo
-from skindb.errors import Fault, InputError, require
+from skindb.errors import Fault, InputError, input_error, require
 from skindb.files import plain
 
 if TYPE_CHECKING:
@@ -270,8 +270,9 @@ def chosen_takes(
     chosen = list(takes) or database.takes(kind)
     if not chosen:
         cure = "run skindb edit first" if kind == "edit" else "run skindb fit first"
-        rule = f"there must be a take with a {kind}"
-        raise InputError(Fault(database.url, rule, "none", cure))
+        raise input_error(
+            database.url, f"there must be a take with a {kind}", "none", cure
+        )
     return chosen
 
 

@@ -19,7 +19,7 @@ from skindb.cli.shared import (
     shared_path,
 )
 from skindb.cli.terminal import bar, confirm, echo
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 
 if TYPE_CHECKING:
     from skindb.store import Database
@@ -51,7 +51,7 @@ def consent(db: str, subject: str, scope: str | None) -> None:
         if not names or ("none" in names and len(names) > 1):
             rule = "must name scopes, or be the single word none"
             text = repr(scope)
-            raise InputError(Fault("--scope", rule, text, "for example fit,statistics"))
+            raise input_error("--scope", rule, text, "for example fit,statistics")
         names = [] if names == ["none"] else names
         skindb.workflow.record_consent(database, subject, names)
     history = database.consent_history(subject)
@@ -272,10 +272,8 @@ def _is_confirmed(question: str) -> bool:
     except click.Abort:
         if sys.stdin.isatty():
             raise
-        raise InputError(
-            Fault(
-                "withdraw", "must be confirmed", "no terminal to ask on", "give --yes"
-            )
+        raise input_error(
+            "withdraw", "must be confirmed", "no terminal to ask on", "give --yes"
         ) from None
 
 

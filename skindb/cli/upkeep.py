@@ -18,7 +18,7 @@ from skindb.cli.options import DB, PATH, asked, common
 from skindb.cli.shared import aligned, calibration_lines, emit, existing
 from skindb.cli.subjects import stale_as_json
 from skindb.cli.terminal import bar
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 
 if TYPE_CHECKING:
     from skindb.store import BackupReport, Database, Garbage, Restored
@@ -130,10 +130,11 @@ def _sample_lines(database: Database, take: str) -> list[str]:
         ]
     except (KeyError, TypeError, ValueError, AttributeError):
         # a record that another program wrote
-        rule = "its record must hold the number of samples of surfels"
-        cure = "restore it from a backup"
-        raise InputError(
-            Fault(f"capture of {take}", rule, "a different summary", cure)
+        raise input_error(
+            f"capture of {take}",
+            "its record must hold the number of samples of surfels",
+            "a different summary",
+            "restore it from a backup",
         ) from None
 
 

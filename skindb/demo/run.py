@@ -12,7 +12,7 @@ import numpy as np
 from skindb import workflow
 from skindb.demo.report import VIEWER, Results, write_report
 from skindb.elementwise import thread_count
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.export.bundle import export_bundle
 from skindb.files import make_private, private_file
 from skindb.parameters import DemoParameters, FitParameters, SimulationParameters
@@ -137,21 +137,22 @@ def _remove_earlier_demo(out: Path) -> None:
     """Remove the files of an earlier demo; a folder with other content is refused."""
     mark = out / ".skindb-demo"
     if out.exists() and any(out.iterdir()) and not mark.exists():
-        rule = "the folder of the demo must be absent, empty or from an earlier demo"
-        raise InputError(Fault(str(out), rule, "other files", "choose another --out"))
+        raise input_error(
+            str(out),
+            "the folder of the demo must be absent, empty or from an earlier demo",
+            "other files",
+            "choose another --out",
+        )
     added = sorted(
         set(Database(out / "db").subjects())
         - {person.subject for person in default_people()}
     )
     if added:
-        rule = "the database of the demo, which is deleted, must have no other subjects"
-        raise InputError(
-            Fault(
-                str(out / "db"),
-                rule,
-                ", ".join(added),
-                "choose another --out, or move the database",
-            )
+        raise input_error(
+            str(out / "db"),
+            "the database of the demo, which is deleted, must have no other subjects",
+            ", ".join(added),
+            "choose another --out, or move the database",
         )
     for name in ("captures", "db", "export"):
         shutil.rmtree(out / name, ignore_errors=True)

@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 
 from skindb import __version__
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.export.gltf import export_gltf
 from skindb.export.inputs import describe_edit
 from skindb.export.maps import TextureMap, texture_maps
@@ -277,13 +277,11 @@ def export_bundle(
     target = Path(out).absolute()  # absolute, as "." has no name
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         content = "files in it" if target.is_dir() else "a file"
-        raise InputError(
-            Fault(
-                str(target),
-                "must be a new or empty folder",
-                content,
-                "choose another folder",
-            )
+        raise input_error(
+            str(target),
+            "must be a new or empty folder",
+            content,
+            "choose another folder",
         )
     report = progress or silent
     staged = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.partial")
@@ -292,9 +290,7 @@ def export_bundle(
     except OSError as error:
         rule = "must be a folder that can be created"
         content = error.strerror or str(error)
-        raise InputError(
-            Fault(str(target), rule, content, "choose another folder")
-        ) from None
+        raise input_error(str(target), rule, content, "choose another folder") from None
     try:
         described = _write_parts(model, staged, size, merl, report)
         manifest = _manifest(model, staged, described)

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.files import plain
 from skindb.geometry.rays import RAY_OFFSET_MM, RayScene
 from skindb.optics.diffusion import (
@@ -71,19 +71,17 @@ def chosen_size(model: xr.DataTree, size: int | None) -> int:
     """
     side = texture_size(model) if size is None else size
     if side < 1:
-        raise InputError(Fault("size", "must be positive", str(side), "omit it"))
+        raise input_error("size", "must be positive", str(side), "omit it")
     needed = BYTES_PER_TEXEL * side**2
     free = _free_memory()
     if needed > free:
         rule = f"maps of {side} x {side} texels need {needed / 1e9:.1f} GB of memory"
         cure = "choose a smaller size"
-        raise InputError(
-            Fault(
-                "size",
-                rule,
-                f"{free / 1e9:.1f} GB",
-                f"{cure}, for example {texture_size(model)}",
-            )
+        raise input_error(
+            "size",
+            rule,
+            f"{free / 1e9:.1f} GB",
+            f"{cure}, for example {texture_size(model)}",
         )
     return side
 
@@ -125,7 +123,7 @@ def required(model: xr.DataTree) -> xr.Dataset:
             if not np.isfinite(corner).all()
             else "no triangle with an area"
         )
-        raise InputError(Fault("fitted[surfel_uv]", rule, fault, cure))
+        raise input_error("fitted[surfel_uv]", rule, fault, cure)
     return fitted
 
 

@@ -29,7 +29,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from skindb.elementwise import thread_count
-from skindb.errors import Fault, InputError, attempt, require
+from skindb.errors import Fault, InputError, attempt, input_error, require
 from skindb.files import open_regular, private_file, read_regular
 from skindb.format.fields import IDENTIFIER, Fields, short
 from skindb.limits import (
@@ -172,8 +172,9 @@ def _whole_image(path: Path) -> Iterator[None]:
     try:
         yield
     except UnreadableError as error:
-        rule = "a frame must be a whole image file"
-        raise InputError(Fault(str(path), rule, str(error), CURE)) from None
+        raise input_error(
+            str(path), "a frame must be a whole image file", str(error), CURE
+        ) from None
 
 
 def read_frame(

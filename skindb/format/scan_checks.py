@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, input_error
 from skindb.format.dome import CameraRecord, DomeRecord
 from skindb.geometry.clean import CleanMesh
 from skindb.geometry.mesh import (
@@ -315,9 +315,11 @@ def parsed_crop(value: Any, where: str) -> Crop:
     if not isinstance(value, dict) or not (
         is_point(value.get("low")) and is_point(value.get("high"))
     ):
-        rule = 'a crop box must be {"low": [x, y, z], "high": [x, y, z]} in mm'
-        raise InputError(
-            Fault(where, rule, str(value)[:80], "correct it, or remove the file")
+        raise input_error(
+            where,
+            'a crop box must be {"low": [x, y, z], "high": [x, y, z]} in mm',
+            str(value)[:80],
+            "correct it, or remove the file",
         )
     low, high = (tuple(map(float, value[corner])) for corner in ("low", "high"))
     return Crop((low[0], low[1], low[2]), (high[0], high[1], high[2]))

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skindb.errors import Fault, InputError
+from skindb.errors import InputError, input_error
 from skindb.format.frames import is_linear, read_frame
 from skindb.hw.cameras import Cameras
 from skindb.hw.capture_folder import Setup
@@ -327,11 +327,12 @@ def measure_lamp(dome: Dome, cameras: Cameras, setup: Setup, stated: int) -> flo
         text = f"{brightness:.1f} lights"
         if np.isnan(brightness):
             text = "lights that are not visible beside it"
-        rule = (
-            f"must be as bright as {stated} lights, and at least {MIN_LAMP:.0%} of that"
+        raise input_error(
+            "steady lamp",
+            f"must be as bright as {stated} lights, and at least {MIN_LAMP:.0%} of that",
+            text,
+            "make it brighter, or state its brightness with --base-light",
         )
-        cure = "make it brighter, or state its brightness with --base-light"
-        raise InputError(Fault("steady lamp", rule, text, cure))
     return brightness
 
 
@@ -350,22 +351,25 @@ def _require_visible(dome: Dome, cameras: Cameras, setup: Setup, stated: int) ->
             "must leave room for a light in every exposure, at most "
             f"{MAX_FILLED_LEVEL:.0%} of white"
         )
-        cure = "shorten that exposure in dome.json, or make the lamp darker"
-        text = f"a dark frame of {level[filled[0]]:.0%} in exposure {filled[0]}"
-        raise InputError(Fault("steady lamp", rule, text, cure))
+        raise input_error(
+            "steady lamp",
+            rule,
+            f"a dark frame of {level[filled[0]]:.0%} in exposure {filled[0]}",
+            "shorten that exposure in dome.json, or make the lamp darker",
+        )
     exposure = usable_exposure(schedule, levels, setup.dome)
     if not exposure:
-        rule = f"must be at most {MAX_LAMP_LEVEL:.0%} of white in the shortest exposure"
-        text = f"a dark frame of {min(level.values()):.0%}"
-        raise InputError(
-            Fault("steady lamp", rule, text, "add a shorter exposure to dome.json")
+        raise input_error(
+            "steady lamp",
+            f"must be at most {MAX_LAMP_LEVEL:.0%} of white in the shortest exposure",
+            f"a dark frame of {min(level.values()):.0%}",
+            "add a shorter exposure to dome.json",
         )
     if not level[exposure] > (0.0 if levels.linear else MIN_LAMP_LEVEL):
-        rule = f"must be as bright as {stated} lights"
-        text = (
-            f"dark frames of {max(level[exposure], 0.0):.1%} of white, so no lamp is on"
-        )
-        raise InputError(
-            Fault("steady lamp", rule, text, "switch it on, or omit --base-light")
+        raise input_error(
+            "steady lamp",
+            f"must be as bright as {stated} lights",
+            f"dark frames of {max(level[exposure], 0.0):.1%} of white, so no lamp is on",
+            "switch it on, or omit --base-light",
         )
     return exposure

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from skindb.clock import SYSTEM_CLOCK, Clock
-from skindb.errors import Fault, InputError, system_fault
+from skindb.errors import InputError, input_error, system_fault
 from skindb.format.frames import frame_size
 from skindb.types import Float64, Index
 
@@ -95,12 +95,11 @@ class FolderCameras:
         self._quiet = quiet
         self._clock = clock
         if missing := [name for name in ids if not (self.root / name).is_dir()]:
-            rule = "must have a subfolder for each camera"
-            cure = "set the folders in the tethering tool"
-            raise InputError(
-                Fault(
-                    str(self.root), rule, f"no subfolder {', '.join(missing[:5])}", cure
-                )
+            raise input_error(
+                str(self.root),
+                "must have a subfolder for each camera",
+                f"no subfolder {', '.join(missing[:5])}",
+                "set the folders in the tethering tool",
             )
         self._before: dict[Path, int] = {}  # file -> modification time [ns]
 

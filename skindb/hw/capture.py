@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 from skindb.hw.brightness import Levels, failed_lights, lamp_brightness, measure_lamp
 from skindb.hw.cameras import Cameras
 from skindb.hw.capture_folder import (
@@ -100,13 +100,11 @@ def planned_schedule(setup: Setup, plan: CapturePlan) -> Schedule:
                 f"with at most {MAX_FLASHES} flashes in a second the sequence lasts at "
                 f"least {shortest:.1f} s"
             )
-            raise InputError(
-                Fault(
-                    "sequence",
-                    rule,
-                    f"{plan.seconds:g} s",
-                    "allow more time, or omit --slower",
-                )
+            raise input_error(
+                "sequence",
+                rule,
+                f"{plan.seconds:g} s",
+                "allow more time, or omit --slower",
             )
     return with_dark_frames(schedule)
 
@@ -344,10 +342,11 @@ def _measure_sites(
                 keep_site(session, run, number)
                 break
             except KeyboardInterrupt:
-                cure = "run the same command again; it resumes with this placement"
-                text = f"stopped by the operator at {site}, placement {number}"
-                raise InputError(
-                    Fault("capture", "must run to its end", text, cure)
+                raise input_error(
+                    "capture",
+                    "must run to its end",
+                    f"stopped by the operator at {site}, placement {number}",
+                    "run the same command again; it resumes with this placement",
                 ) from None
             except InputError as error:
                 keep_failed_placement(session, site, number, error, readings)
@@ -368,10 +367,8 @@ def _measure_site(
 ) -> SiteRun:
     # `_require_devices` asserts it
     if devices.probe is None or devices.probe_camera is None:
-        raise InputError(
-            Fault(
-                "probe", "must be connected to measure sites", "no probe", "connect it"
-            )
+        raise input_error(
+            "probe", "must be connected to measure sites", "no probe", "connect it"
         )
 
     def advance(done: int, total: int) -> None:

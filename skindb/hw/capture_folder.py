@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from skindb.errors import Fault, InputError, system_fault
+from skindb.errors import Fault, InputError, input_error, system_fault
 from skindb.files import make_private, private_file
 from skindb.format.fields import read_json
 from skindb.format.frames import (
@@ -139,8 +139,12 @@ def open_unfinished(folder: Path, identity: Mapping[str, Any]) -> Unfinished:
             if (folder / "capture.json").is_file()
             else "other files"
         )
-        rule = "must be a new folder, or that of an unfinished capture"
-        raise InputError(Fault(str(folder), rule, text, "choose another folder"))
+        raise input_error(
+            str(folder),
+            "must be a new folder, or that of an unfinished capture",
+            text,
+            "choose another folder",
+        )
     begun = _read(folder, path, note)
     if begun.started:
         _require_same(folder, begun.identity, identity)
@@ -163,14 +167,11 @@ def _read(folder: Path, path: Path, note: Any) -> Unfinished:
     ) and isinstance(flashes, int)
     sound = sound and (running is None or _is_run(running))
     if not isinstance(identity, dict) or sequence is None or sites is None or not sound:
-        cure = "choose another folder; the existing frames are kept"
-        raise InputError(
-            Fault(
-                str(path),
-                "must be the record of an unfinished capture",
-                "other content",
-                cure,
-            )
+        raise input_error(
+            str(path),
+            "must be the record of an unfinished capture",
+            "other content",
+            "choose another folder; the existing frames are kept",
         )
     return Unfinished(
         folder,
@@ -249,9 +250,12 @@ def one_session(out: Path) -> Iterator[None]:
                 # the other session ended between opening and locking
                 raise FileNotFoundError
         except (BlockingIOError, FileNotFoundError):
-            rule = "only one session at a time may write into a folder"
-            cure = "wait until the other session has ended"
-            raise InputError(Fault(str(out), rule, "another session", cure)) from None
+            raise input_error(
+                str(out),
+                "only one session at a time may write into a folder",
+                "another session",
+                "wait until the other session has ended",
+            ) from None
         try:
             yield
         finally:
@@ -375,14 +379,11 @@ def require_space(folder: Path, setup: Setup, steps: int) -> None:
     needed = steps * pixels * 3 * 2  # bytes of three channels of 16 bits
     free = shutil.disk_usage(folder).free
     if free < needed:
-        rule = f"{steps} steps of {len(setup.cameras)} cameras need up to {needed / 1e9:.1f} GB"
-        raise InputError(
-            Fault(
-                str(folder),
-                rule,
-                f"{free / 1e9:.1f} GB free",
-                "free some space, or choose another disk",
-            )
+        raise input_error(
+            str(folder),
+            f"{steps} steps of {len(setup.cameras)} cameras need up to {needed / 1e9:.1f} GB",
+            f"{free / 1e9:.1f} GB free",
+            "free some space, or choose another disk",
         )
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, input_error
 from skindb.hw.link import (
     CLOCK_ERROR,
     EARLY_SECONDS,
@@ -194,9 +194,11 @@ class Probe:
             If the probe stops answering, or if it or its gauge sends what cannot be right.
         """
         if not -MAX_SUCTION_KPA <= pressure < 0:
-            rule = f"the suction must be from {-MAX_SUCTION_KPA:g} to 0 kPa"
-            raise InputError(
-                Fault("probe", rule, f"{pressure:g} kPa", "use about -5 kPa")
+            raise input_error(
+                "probe",
+                f"the suction must be from {-MAX_SUCTION_KPA:g} to 0 kPa",
+                f"{pressure:g} kPa",
+                "use about -5 kPa",
             )
         self.link.discard_events()
         lost = self.link.lost_events

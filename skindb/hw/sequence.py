@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error, require
 
 DARK = "-"  # id in place of a light when all lights are off
 # between two steps, while the lights are off and the cameras read out
@@ -126,29 +126,27 @@ def plan_schedule(
         If the exposures take longer than `seconds`.
     """
     pairs = [(light, name) for name in exposures for light in lights]
-    if not pairs:
-        raise InputError(
-            Fault(
-                "sequence",
-                "must have lights and exposures",
-                "none",
-                "name at least one of each",
-            )
-        )
+    require(
+        pairs,
+        "sequence",
+        "must have lights and exposures",
+        "none",
+        "name at least one of each",
+    )
     if bad := [name for name, time in exposures.items() if not 1e-6 <= time <= 60]:
-        rule = "an exposure must last 1e-6 to 60 s"
-        text = f"{exposures[bad[0]]} s for {bad[0]}"
-        raise InputError(Fault("sequence", rule, text, ""))
+        raise input_error(
+            "sequence",
+            "an exposure must last 1e-6 to 60 s",
+            f"{exposures[bad[0]]} s for {bad[0]}",
+            "",
+        )
     shortest = sum(max(exposures[name] + GAP_SECONDS, period) for _, name in pairs)
     if seconds is not None and seconds < shortest - 1e-9:
-        cure = "allow more time, or shorten the exposures"
-        raise InputError(
-            Fault(
-                "sequence",
-                f"must last at least {shortest:.3f} s",
-                f"{seconds:g} s",
-                cure,
-            )
+        raise input_error(
+            "sequence",
+            f"must last at least {shortest:.3f} s",
+            f"{seconds:g} s",
+            "allow more time, or shorten the exposures",
         )
     stretch = 0.0 if seconds is None else (seconds - shortest) / len(pairs)
     steps = list[Step]()

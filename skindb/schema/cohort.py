@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 from skindb.schema.label import label, text_labels
 from skindb.schema.notes import note
 from skindb.schema.variables import VARIABLES
@@ -264,19 +264,12 @@ def require_takes(cohort: xr.Dataset, layout: str) -> None:
     cure = f'use db.cohort("{layout}")'
     if TAKE not in cohort.dims:
         dims = ", ".join(map(str, cohort.dims)) or "none"
-        raise InputError(
-            Fault(
-                "cohort",
-                "must have the dimension take",
-                f"the dimensions {dims}",
-                cure,
-            )
+        raise input_error(
+            "cohort", "must have the dimension take", f"the dimensions {dims}", cure
         )
     if layout == "maps" and "v" not in cohort.dims:
-        raise InputError(
-            Fault(
-                "cohort", "must hold maps with the dimensions v and u", "tables", cure
-            )
+        raise input_error(
+            "cohort", "must hold maps with the dimensions v and u", "tables", cure
         )
 
 

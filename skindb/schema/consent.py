@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 
 SCOPES = ("fit", "statistics", "export", "publish")
 CONSENT = "consent"  # kind of the versions that record what a subject agreed to
@@ -23,11 +23,11 @@ def require_consent(attrs: Mapping[Any, Any], scope: str) -> None:
         return
     who = str(attrs.get("take", attrs.get("subject", "the subject")))
     text = f"only {', '.join(scopes)}" if scopes else "no scope at all"
-    cure = "ask the subject, then record the answer with skindb consent"
-    raise InputError(
-        Fault(
-            f"{who}: consent_scope", f"this step needs the scope {scope!r}", text, cure
-        )
+    raise input_error(
+        f"{who}: consent_scope",
+        f"this step needs the scope {scope!r}",
+        text,
+        "ask the subject, then record the answer with skindb consent",
     )
 
 

@@ -20,7 +20,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import TypeVar
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error, require
 from skindb.store.bucket import place_at
 from skindb.store.erasure import remainder_of
 from skindb.store.lease import Lease
@@ -125,13 +125,11 @@ class Archive:
         """
         if self.place.file_type(f"{WITHDRAWN}/{BACKUP}") != "file":
             finding = "another folder" if self.place.names() else "nothing"
-            raise InputError(
-                Fault(
-                    self.place.name,
-                    "must be a backup",
-                    finding,
-                    "give the folder of skindb backup",
-                )
+            raise input_error(
+                self.place.name,
+                "must be a backup",
+                finding,
+                "give the folder of skindb backup",
             )
         faults = marker_faults(self.place)
         if faults:
@@ -139,12 +137,13 @@ class Archive:
 
     def require_of(self, place: Place) -> None:
         """Raise an `InputError` unless it is a backup of this database."""
-        if require_secret(place) != require_secret(self.place):
-            rule = "all states of a backup must be of the same database"
-            cure = "give another folder"
-            raise InputError(
-                Fault(self.place.name, rule, "a backup of another database", cure)
-            )
+        require(
+            require_secret(place) == require_secret(self.place),
+            self.place.name,
+            "all states of a backup must be of the same database",
+            "a backup of another database",
+            "give another folder",
+        )
 
     def adopt(self, place: Place) -> Markers:
         """Copy the withdrawals of a database, which must be that of the backup; returns
@@ -171,10 +170,13 @@ class Archive:
     def newest(self) -> int:
         """Number of the newest state; `InputError` if there is none."""
         numbers = self.numbers()
-        if not numbers:
-            rule = "a backup must hold a state"
-            cure = "run skindb backup again"
-            raise InputError(Fault(self.place.name, rule, "none", cure))
+        require(
+            numbers,
+            self.place.name,
+            "a backup must hold a state",
+            "none",
+            "run skindb backup again",
+        )
         return numbers[-1]
 
     def state(self, number: int) -> State:
@@ -182,10 +184,12 @@ class Archive:
         key = f"{STATES}/{number:06d}.json"
         numbers = self.numbers()
         if number not in numbers:
-            rule = f"state {number} must exist"
-            finding = f"states {', '.join(map(str, numbers)) or 'none'}"
-            cure = "see skindb restore --list"
-            raise InputError(Fault(self.place.name, rule, finding, cure))
+            raise input_error(
+                self.place.name,
+                f"state {number} must exist",
+                f"states {', '.join(map(str, numbers)) or 'none'}",
+                "see skindb restore --list",
+            )
         with damage_as_fault(self.place.where(key), AS_WRITTEN, CURE_STATE):
             body = sealed_object(self.place.read_small(key))
             format_ = body.pop("format")
@@ -236,9 +240,7 @@ class Archive:
         except (OSError, InputError) as error:
             finding = reason_of(error)
         location = place.where(key)
-        raise InputError(
-            Fault(location, AS_WRITTEN, f"{finding} for {name}", CURE_CONTENT)
-        )
+        raise input_error(location, AS_WRITTEN, f"{finding} for {name}", CURE_CONTENT)
 
     def put(self, content: bytes, digest: str, guard: Callable[[], None]) -> None:
         """Write a content under its digest, unless the guard raises."""
@@ -361,10 +363,11 @@ def require_apart(backup: Place, database: Place) -> None:
     inner = backup.url(FILES).removesuffix(FILES)
     outer = database.url(FILES).removesuffix(FILES)
     if inner.startswith(outer) or outer.startswith(inner):
-        rule = "a backup must not be inside its database, nor the database inside it"
-        cure = "give another folder"
-        raise InputError(
-            Fault(backup.name, rule, f"the database {database.name}", cure)
+        raise input_error(
+            backup.name,
+            "a backup must not be inside its database, nor the database inside it",
+            f"the database {database.name}",
+            "give another folder",
         )
 
 

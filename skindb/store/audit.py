@@ -21,7 +21,7 @@ from functools import partial
 from typing import Any
 
 from skindb import __version__
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 from skindb.store.condition import evaluate
 from skindb.store.markers import is_sealed, keyed_hash, keyed_seal, require_secret
 from skindb.store.place import AUDIT, Place, UnavailableError, subject_of
@@ -128,8 +128,12 @@ def append_entry(
         content = json.dumps(body | {"seal": keyed_seal(secret, key, body)}).encode()
         if place.create(key, content):
             return
-    cure = "run skindb verify, which names unknown files there"
-    raise InputError(Fault(place.where(AUDIT), "must have a free number", "none", cure))
+    raise input_error(
+        place.where(AUDIT),
+        "must have a free number",
+        "none",
+        "run skindb verify, which names unknown files there",
+    )
 
 
 def read_audit(

@@ -18,7 +18,7 @@ from functools import partial
 from typing import TypeVar
 
 from skindb import __version__
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 from skindb.schema.consent import CONSENT
 from skindb.store.archive import (
     RECORD_KEY,
@@ -155,14 +155,11 @@ def _repeated(step: Callable[[], T], place: Place) -> T:
             return step()
         except Changed:
             continue
-    rule = "versions and subjects must not be removed all the time while a backup is written"
-    raise InputError(
-        Fault(
-            place.name,
-            rule,
-            f"changes in {MAX_ATTEMPTS} attempts",
-            "run the command again",
-        )
+    raise input_error(
+        place.name,
+        "versions and subjects must not be removed all the time while a backup is written",
+        f"changes in {MAX_ATTEMPTS} attempts",
+        "run the command again",
     )
 
 
@@ -170,13 +167,8 @@ def _begin(place: Place, archive: Archive) -> None:
     """Create a backup, or require that there is one of this database."""
     if not place.file_type(SECRET):
         finding = "nothing" if place.names() is None else "a folder without its secret"
-        raise InputError(
-            Fault(
-                place.name,
-                "must be a database",
-                finding,
-                "give the folder of a database",
-            )
+        raise input_error(
+            place.name, "must be a database", finding, "give the folder of a database"
         )
     faults = marker_faults(place)
     if faults:
@@ -190,10 +182,11 @@ def _begin(place: Place, archive: Archive) -> None:
             if name not in ("staging", SECRET, WITHDRAWN)
         ]
         if foreign:
-            rule = "a backup needs an empty folder, or one with a backup"
-            cure = "give another folder"
-            raise InputError(
-                Fault(dest.name, rule, f"other files, such as {foreign[0]}", cure)
+            raise input_error(
+                dest.name,
+                "a backup needs an empty folder, or one with a backup",
+                f"other files, such as {foreign[0]}",
+                "give another folder",
             )
         dest.create(SECRET, place.read_small(SECRET))
         dest.create(f"{WITHDRAWN}/{BACKUP}", b"{}")
@@ -362,11 +355,11 @@ def _list_twice(place: Place) -> Listing:
         if listing == before:
             return listing
         before = listing
-    rule = "the database must not change all the time while its files are listed"
-    raise InputError(
-        Fault(
-            place.name, rule, f"changes in {MAX_LISTS} lists", "run the command again"
-        )
+    raise input_error(
+        place.name,
+        "the database must not change all the time while its files are listed",
+        f"changes in {MAX_LISTS} lists",
+        "run the command again",
     )
 
 
@@ -410,7 +403,7 @@ def _copy(place: Place, archive: Archive, guard: Callable[[], None], item: Item)
     name, digest, _ = item
     content = _read(place, item)
     if hashlib.sha256(content).hexdigest() != digest:
-        raise InputError(Fault(place.where(name), AS_COMMITTED, CHANGED, CURE))
+        raise input_error(place.where(name), AS_COMMITTED, CHANGED, CURE)
     archive.put(content, digest, guard)
     return len(content)
 

@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 from zarr.abc.store import ByteRequest, Store
 from zarr.core.buffer import Buffer, BufferPrototype
 
-from skindb.errors import Fault, InputError
+from skindb.errors import InputError, input_error
 from skindb.files import cache_folder, make_private
 from skindb.limits import MAX_STORE_JSON_BYTES
 from skindb.store.folder import Folder
@@ -97,10 +97,12 @@ class Bucket:
             or status.st_uid != os.getuid()
             or status.st_mode & 0o077
         ):
-            rule = "must be a folder of this user with permissions 0700"
-            cure = "remove it, or set SKINDB_CACHE"
-            finding = f"a different owner, or permissions {status.st_mode & 0o777:04o}"
-            raise InputError(Fault(str(folder), rule, finding, cure))
+            raise input_error(
+                str(folder),
+                "must be a folder of this user with permissions 0700",
+                f"a different owner, or permissions {status.st_mode & 0o777:04o}",
+                "remove it, or set SKINDB_CACHE",
+            )
         return folder
 
     def marker_file(self) -> Path:
@@ -424,10 +426,12 @@ class Bucket:
         """
         with suppress(UnavailableError):  # checked with the next object
             if not self._is_conditional and self._put_new(path, data):
-                rule = "the server must support conditional put (If-None-Match)"
-                finding = "a server that overwrites objects"
-                cure = "use another server, or a newer version of it"
-                raise InputError(Fault(self.name, rule, finding, cure))
+                raise input_error(
+                    self.name,
+                    "the server must support conditional put (If-None-Match)",
+                    "a server that overwrites objects",
+                    "use another server, or a newer version of it",
+                )
             self._is_conditional = True
 
     def _put(self, path: str, data: bytes) -> str:
@@ -569,11 +573,14 @@ def place_at(url: str) -> Place:
         return Bucket(url)
     if "://" in url:
         scheme = url.partition("://")[0]
-        cure = "give a folder, or s3://BUCKET/PREFIX"
-        rule = "a database must be a local folder or an S3 bucket"
-        raise InputError(Fault(f"{scheme}://...", rule, "a different URL", cure))
+        raise input_error(
+            f"{scheme}://...",
+            "a database must be a local folder or an S3 bucket",
+            "a different URL",
+            "give a folder, or s3://BUCKET/PREFIX",
+        )
     if Path(url).exists() and not Path(url).is_dir():
-        raise InputError(
-            Fault(url, "a database must be a folder", "a file", "choose another folder")
+        raise input_error(
+            url, "a database must be a folder", "a file", "choose another folder"
         )
     return Folder(Path(url))

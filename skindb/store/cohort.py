@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import xarray as xr
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error, require
 from skindb.schema.cohort import (
     Part,
     Source,
@@ -74,17 +74,13 @@ class Address:
         """The record at this address; `InputError` if its seal differs."""
         snapshot = Snapshot(self.place)
         record = snapshot.record(self.kind, self.take, self.generation)
-        if record.seal != self.seal:
-            title = f"{self.kind} of {self.take}"
-            rule = "a version must not change while a cohort refers to it"
-            raise InputError(
-                Fault(
-                    title,
-                    rule,
-                    "a different version of that generation",
-                    "open the cohort again",
-                )
-            )
+        require(
+            record.seal == self.seal,
+            f"{self.kind} of {self.take}",
+            "a version must not change while a cohort refers to it",
+            "a different version of that generation",
+            "open the cohort again",
+        )
         return record
 
 
@@ -154,12 +150,16 @@ def cohort(
     """See `Database.cohort`."""
     layout = request.layout
     if layout not in GROUP:
-        rule = f"must be one of {', '.join(GROUP)}"
-        raise InputError(Fault("layout", rule, repr(layout), "choose one"))
-    if dim not in ("take", "subject"):
-        raise InputError(
-            Fault("dim", "must be take or subject", repr(dim), "choose one")
+        raise input_error(
+            "layout", f"must be one of {', '.join(GROUP)}", repr(layout), "choose one"
         )
+    require(
+        dim in ("take", "subject"),
+        "dim",
+        "must be take or subject",
+        repr(dim),
+        "choose one",
+    )
     chosen = None if variables is None else list(variables)
     base = "registration" if layout == "maps" else kind
     names, skipped = _members(lookup, base, takes)
@@ -208,10 +208,12 @@ def _stored_records(
             "maps": f"maps of {request.size} texels",
         }
         kind = records[missing[0]].kind
-        rule = f"a version of kind {kind} must store {contents[request.layout]} for cohorts"
-        cure = "call skindb.workflow.summarise for them"
-        finding = "none, or different ones"
-        raise InputError(Fault(few_names(missing), rule, finding, cure))
+        raise input_error(
+            few_names(missing),
+            f"a version of kind {kind} must store {contents[request.layout]} for cohorts",
+            "none, or different ones",
+            "call skindb.workflow.summarise for them",
+        )
     return stored
 
 
@@ -272,8 +274,8 @@ def _members(
             if kind == "registration"
             else "run skindb fit first"
         )
-        raise InputError(
-            Fault(lookup.place.name, "a study needs fitted takes", f"no {kind}", cure)
+        raise input_error(
+            lookup.place.name, "a study needs fitted takes", f"no {kind}", cure
         )
     allowed = []
     skipped = []
@@ -302,7 +304,7 @@ def _members(
         if lacks_registration:
             rule = "at least one take must have an up-to-date registration"
             cure = ""
-        raise InputError(Fault("population", rule, finding, cure))
+        raise input_error("population", rule, finding, cure)
     return allowed, skipped
 
 
@@ -484,7 +486,5 @@ def _require_recorded(record: Record, name: str, ds: xr.Dataset) -> xr.Dataset:
     """
     if name in record.contents and describe(ds) != record.contents[name]:
         title = record.title
-        raise InputError(
-            Fault(title, AS_RECORDED, f"a different group {name}", RESTORE)
-        )
+        raise input_error(title, AS_RECORDED, f"a different group {name}", RESTORE)
     return ds

@@ -20,7 +20,7 @@ from datetime import UTC, date, datetime
 from itertools import pairwise
 from typing import Any
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 
 MAX_CHARACTERS = 1_000
 MAX_DEPTH = 16  # of nested conditions
@@ -295,21 +295,21 @@ class _Evaluation:
 def _parsed(text: str) -> tuple[ast.expr, dict[str, str]]:
     """The tree of a condition, and the column by each name that stands for one in backticks."""
     if len(text) > MAX_CHARACTERS:
-        rule = f"a condition must have at most {MAX_CHARACTERS:,} characters"
-        raise InputError(
-            Fault("where", rule, f"{len(text):,}", "select the takes in several steps")
+        raise input_error(
+            "where",
+            f"a condition must have at most {MAX_CHARACTERS:,} characters",
+            f"{len(text):,}",
+            "select the takes in several steps",
         )
     quoted = dict[str, str]()
 
     def name(token: re.Match[str]) -> str:
         if token[3]:
-            raise InputError(
-                Fault(
-                    "where",
-                    "a condition must have no comment",
-                    "the character #",
-                    "remove it",
-                )
+            raise input_error(
+                "where",
+                "a condition must have no comment",
+                "the character #",
+                "remove it",
             )
         if token[2] is None:
             return token[0]
@@ -322,9 +322,11 @@ def _parsed(text: str) -> tuple[ast.expr, dict[str, str]]:
             warnings.simplefilter("error")
             return ast.parse(plain, mode="eval").body, quoted
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
-        finding = f"{text!r} ({error.msg if isinstance(error, SyntaxError) else error})"
-        raise InputError(
-            Fault("where", "a condition must follow the grammar", finding, EXAMPLE)
+        raise input_error(
+            "where",
+            "a condition must follow the grammar",
+            f"{text!r} ({error.msg if isinstance(error, SyntaxError) else error})",
+            EXAMPLE,
         ) from None
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 import xarray as xr
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error, require
 from skindb.schema.consent import CONSENT
 from skindb.store.archive import Archive
 from skindb.store.audit import AuditEntry, append_entry, read_audit
@@ -104,8 +104,12 @@ class Database:
     def root(self) -> Path:
         """The folder of the database; `InputError` if it is in a bucket."""
         if self.folder is None:
-            rule = "the database must be in a local folder"
-            raise InputError(Fault(self.url, rule, "a bucket", "use db.url"))
+            raise input_error(
+                self.url,
+                "the database must be in a local folder",
+                "a bucket",
+                "use db.url",
+            )
         return self.folder
 
     def scratch(self) -> Path:
@@ -441,22 +445,21 @@ class Database:
         for made_from in version.attrs.get("inputs", []):
             if made_from["kind"] == kind and take in (None, made_from["take"]):
                 record = self.record(kind, made_from["take"], made_from["generation"])
-                if made_from["seal"] != record.seal:
-                    rule = f"the {kind} it was made from must exist"
-                    finding = "a different version of that generation"
-                    raise InputError(
-                        Fault(title, rule, finding, "compute the version again")
-                    )
+                require(
+                    made_from["seal"] == record.seal,
+                    title,
+                    f"the {kind} it was made from must exist",
+                    "a different version of that generation",
+                    "compute the version again",
+                )
                 return self.read(
                     kind, made_from["take"], generation=made_from["generation"]
                 )
-        raise InputError(
-            Fault(
-                title,
-                f"its provenance must name a {kind}",
-                "none",
-                "compute the version again",
-            )
+        raise input_error(
+            title,
+            f"its provenance must name a {kind}",
+            "none",
+            "compute the version again",
         )
 
     def stage(
@@ -533,16 +536,13 @@ class Database:
             If the subject was never withdrawn, if the date is before the withdrawal or
             in the future, or if data of the subject remain.
         """
-        if self.has_remains():
-            rule = "a withdrawal must be complete before the subject is admitted again"
-            raise InputError(
-                Fault(
-                    subject,
-                    rule,
-                    "data that are not removed yet",
-                    "run skindb clean --yes",
-                )
-            )
+        require(
+            not self.has_remains(),
+            subject,
+            "a withdrawal must be complete before the subject is admitted again",
+            "data that are not removed yet",
+            "run skindb clean --yes",
+        )
         readmit(self.place, subject, consent)
         note_withdrawals(self.place)
 
@@ -564,15 +564,11 @@ class Database:
             If `path` is not the path of a version of this take, or if the log cannot be read.
         """
         if not path.startswith(f"data/{kind}/{take}/"):
-            location = f"{self.url}: {path[:200]!r}"
-            rule = f"must be the path of a {kind} of {take}"
-            raise InputError(
-                Fault(
-                    location,
-                    rule,
-                    "a different path",
-                    "remove the folder tmp of the database",
-                )
+            raise input_error(
+                f"{self.url}: {path[:200]!r}",
+                f"must be the path of a {kind} of {take}",
+                "a different path",
+                "remove the folder tmp of the database",
             )
         log = Log(self.place, kind, take)
         if path not in {log.read(generation).path for generation in log.generations()}:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error, require
 from skindb.schema.consent import CONSENT, SCOPES, consent_scope
 from skindb.store.markers import note_consents
 from skindb.store.place import RELEASE, TAKE, Place, require_text, subject_of
@@ -22,7 +22,7 @@ def record_consent(place: Place, subject: str, scope: Iterable[str]) -> Record:
     if unknown := [name for name in scopes if name not in SCOPES]:
         rule = f"a scope must be one of {', '.join(SCOPES)}"
         finding = ", ".join(map(repr, unknown))
-        raise InputError(Fault("scope", rule, finding, "choose from these"))
+        raise input_error("scope", rule, finding, "choose from these")
     _require_subject(place, subject)
     with Stage(place, CONSENT, subject) as stage:
         record = stage.commit({"subject": subject, "consent_scope": scopes})
@@ -57,18 +57,21 @@ def create_release(place: Place, name: str, takes: Sequence[str] | None) -> Reco
     require_text(name, TAKE, "name of a release")
     snapshot = Snapshot(place)
     if snapshot.has(RELEASE, name):
-        finding = f"a release of {snapshot.record(RELEASE, name).created}"
-        rule = "a release must have a new name"
-        raise InputError(Fault(name, rule, finding, "choose another name"))
+        raise input_error(
+            name,
+            "a release must have a new name",
+            f"a release of {snapshot.record(RELEASE, name).created}",
+            "choose another name",
+        )
     fitted = snapshot.takes("model")
     names = fitted if takes is None else list(dict.fromkeys(takes))
     if unknown := [take for take in names if take not in fitted]:
         rule = "a release must consist of takes with a model"
         cure = f"takes with a model: {', '.join(fitted) or 'none'}"
         raise InputError(Fault(take, rule, "no model", cure) for take in unknown)
-    if not names:
-        rule = "a release needs fitted takes"
-        raise InputError(Fault(name, rule, "no model", "run skindb fit first"))
+    require(
+        names, name, "a release needs fitted takes", "no model", "run skindb fit first"
+    )
     pins = [
         snapshot.record(kind, take).as_input()
         for take in names
@@ -96,5 +99,4 @@ def _require_subject(place: Place, subject: str) -> None:
     cure = "see skindb info"
     if subject_of(subject) in subjects:
         cure = f"the subject of that take is {subject_of(subject)}"
-    rule = "the database must hold the subject"
-    raise InputError(Fault(subject, rule, finding, cure))
+    raise input_error(subject, "the database must hold the subject", finding, cure)

@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-from skindb.errors import Fault, InputError
+from skindb.errors import InputError, input_error
 from skindb.schema.consent import CONSENT
 from skindb.store.decisions import commit_release
 from skindb.store.folder import remove_tree
@@ -295,23 +295,19 @@ def subject_holdings(place: Place, subject: str) -> Holdings:
             if re.fullmatch(TAKE, subject)
             else "see skindb info"
         )
-        raise InputError(
-            Fault(
-                repr(subject)[:200], rule, "a name that is not that of a subject", cure
-            )
+        raise input_error(
+            repr(subject)[:200], rule, "a name that is not that of a subject", cure
         )
     markers = read_markers(place)
     holdings = holdings_of(place, markers.with_withdrawn(subject))
     if markers.is_withdrawn(subject):
         if holdings:
             return holdings
-        raise InputError(
-            Fault(
-                subject,
-                rule,
-                "that the subject was withdrawn, and nothing is left",
-                "see skindb info",
-            )
+        raise input_error(
+            subject,
+            rule,
+            "that the subject was withdrawn, and nothing is left",
+            "see skindb info",
         )
     if holdings == holdings_of(place, markers):
         takes = {
@@ -329,7 +325,7 @@ def subject_holdings(place: Place, subject: str) -> Holdings:
         finding = f"subjects: {', '.join(subjects[:8]) or 'none'}" + (
             ", ..." if len(subjects) > 8 else ""
         )
-        raise InputError(Fault(subject, rule, finding, "see skindb info"))
+        raise input_error(subject, rule, finding, "see skindb info")
     return holdings
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cache, partial
 from typing import cast
 
-from skindb.errors import Fault, InputError
+from skindb.errors import InputError, input_error
 from skindb.limits import RESUMABLE_SECONDS
 from skindb.schema.consent import CONSENT
 from skindb.store.erasure import SCRATCH_NAME, erase_withdrawn, holdings_of
@@ -314,9 +314,11 @@ def _abandoned_leases(
 def _old_generations(place: Place, generations: int, now: Clock) -> Iterator[Garbage]:
     """Generations that are neither among the newest ones nor inputs of a version that is kept."""
     if generations < 1:
-        rule = "must be at least 1, because the newest generation is kept"
-        raise InputError(
-            Fault("generations", rule, str(generations), "choose a larger number")
+        raise input_error(
+            "generations",
+            "must be at least 1, because the newest generation is kept",
+            str(generations),
+            "choose a larger number",
         )
     listed: dict[tuple[str, str, int], Record] = {}
     waiting: list[Record] = []

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import Any
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 from skindb.schema.consent import CONSENT, consent_scope
 from skindb.store.log import Log
 from skindb.store.place import (
@@ -96,10 +96,8 @@ def require_own_subject(kind: str, take: str, names: Iterable[str]) -> None:
             "commit what many subjects share as a kind of its own, and name that "
             "version as the input"
         )
-        raise InputError(
-            Fault(
-                f"{kind} of {take}", rule, f"a reference to {', '.join(foreign)}", cure
-            )
+        raise input_error(
+            f"{kind} of {take}", rule, f"a reference to {', '.join(foreign)}", cure
         )
 
 

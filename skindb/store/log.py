@@ -19,7 +19,7 @@ from datetime import UTC, datetime
 from functools import partial
 from typing import Any
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 from skindb.store.markers import WithdrawnError
 from skindb.store.place import (
     KIND,
@@ -115,10 +115,8 @@ class Log:
                 else f"generation {generation} must exist"
             )
             finding = f"generations {listed}" if listed else "nothing"
-            raise InputError(
-                Fault(
-                    f"{self.place.name}: {self.what}", rule, finding, "see skindb info"
-                )
+            raise input_error(
+                f"{self.place.name}: {self.what}", rule, finding, "see skindb info"
             )
         record = self._read(listed[-1] if generation is None else generation)
         if fault := self._mismatch_fault(head, record):
@@ -385,8 +383,9 @@ def read_record(place: Place, key: str) -> tuple[Record, str]:
         if isinstance(error, LaterError):
             finding += ", written by a later version of skindb"
             cure = UPDATE
-    rule = "a record of the log must be as committed"
-    raise InputError(Fault(place.where(key), rule, finding, cure))
+    raise input_error(
+        place.where(key), "a record of the log must be as committed", finding, cure
+    )
 
 
 def tombstone_of(seal: str) -> str:

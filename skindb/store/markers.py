@@ -47,7 +47,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from skindb.errors import Fault, InputError, SkindbWarning, system_fault
+from skindb.errors import (
+    Fault,
+    InputError,
+    SkindbWarning,
+    input_error,
+    require,
+    system_fault,
+)
 from skindb.files import PRIVATE_FILE, make_private, read_regular
 from skindb.limits import MAX_STORE_JSON_BYTES
 from skindb.schema.consent import SCOPES, consent_scope
@@ -269,25 +276,28 @@ def readmit(place: Place, subject: str, consent: date) -> None:
     rule = "a new consent must be given after the withdrawal of the subject, and not in the future"
     cure = "state the date on which the subject signed it"
     if entry is None:
-        rule = "a new consent is only for a subject who was withdrawn"
-        raise InputError(
-            Fault(subject, rule, "no withdrawal", "run the command without it")
+        raise input_error(
+            subject,
+            "a new consent is only for a subject who was withdrawn",
+            "no withdrawal",
+            "run the command without it",
         )
     if not entry.is_withdrawal:
         if entry.date == consent:  # the run that admitted the subject was interrupted
             return
-        finding = f"the new consent of {entry.date}"
-        raise InputError(
-            Fault(
-                subject,
-                "a subject is admitted again once",
-                finding,
-                "run the command without it",
-            )
+        raise input_error(
+            subject,
+            "a subject is admitted again once",
+            f"the new consent of {entry.date}",
+            "run the command without it",
         )
-    if not entry.date <= consent <= date.today():
-        finding = f"{consent}, and a withdrawal on {entry.date}"
-        raise InputError(Fault(subject, rule, finding, cure))
+    require(
+        entry.date <= consent <= date.today(),
+        subject,
+        rule,
+        f"{consent}, and a withdrawal on {entry.date}",
+        cure,
+    )
     if not _create_entry(
         place, subject, entry.number + 1, {"readmitted": consent.isoformat()}
     ):
@@ -316,9 +326,7 @@ def _numbers(place: Place) -> dict[str, int]:
     names = place.sizes(WITHDRAWN)
     for name, (finding, cure) in LOCKS.items():
         if name in names and not place.is_unlocked:
-            raise InputError(
-                Fault(place.name, "must be a complete database", finding, cure)
-            )
+            raise input_error(place.name, "must be a complete database", finding, cure)
     return entry_numbers(names)
 
 

@@ -12,7 +12,7 @@ from typing import Protocol
 
 from zarr.abc.store import Store
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 
 STUDY = "population"  # results of a study of many takes
 RELEASE = "release"  # one version of every take under a name
@@ -47,10 +47,8 @@ def subject_of(take: str) -> str:
 def require_text(value: str, pattern: str, label: str) -> str:
     """Return `value` if it matches the whole pattern; otherwise raise an `InputError`."""
     if not isinstance(value, str) or not re.fullmatch(pattern, value):
-        raise InputError(
-            Fault(
-                label, f"must match {pattern}", repr(value)[:200], "choose another name"
-            )
+        raise input_error(
+            label, f"must match {pattern}", repr(value)[:200], "choose another name"
         )
     return value
 

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Any, TypeGuard, TypeVar
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 from skindb.files import json_depth
 from skindb.limits import MAX_JSON_DEPTH
 from skindb.schema import SCHEMA_VERSION, VARIABLES
@@ -97,7 +97,7 @@ def damage_as_fault(location: str, rule: str, cure: str) -> Iterator[None]:
     except UnavailableError:
         raise
     except DAMAGE as error:
-        raise InputError(Fault(location, rule, reason_of(error), cure)) from None
+        raise input_error(location, rule, reason_of(error), cure) from None
 
 
 def intact_or_none(read: Callable[[], T]) -> T | None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, input_error
 from skindb.schema.consent import CONSENT
 from skindb.store.archive import (
     Archive,
@@ -119,8 +119,12 @@ def restore(
             "a restore needs the marker file, because subjects who were withdrawn "
             "after the backup would come back"
         )
-        cure = "give --markers FILE, or --without-markers to accept this risk"
-        raise InputError(Fault(str(file), rule, "no such file", cure))
+        raise input_error(
+            str(file),
+            rule,
+            "no such file",
+            "give --markers FILE, or --without-markers to accept this risk",
+        )
     archive = Archive(place_at(source))
     archive.require()
     place.is_unlocked = True
@@ -218,7 +222,7 @@ def _require_empty(place: Place) -> None:
             if {"log", WITHDRAWN} & {*names}
             else f"other files, such as {foreign[0]}"
         )
-        raise InputError(Fault(place.name, rule, finding, cure))
+        raise input_error(place.name, rule, finding, cure)
 
 
 def _copy_all(archive: Archive, place: Place, plan: Plan) -> int:

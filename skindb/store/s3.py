@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, input_error
 from skindb.store.place import UnavailableError
 
 if TYPE_CHECKING:
@@ -64,8 +64,12 @@ def bucket_and_prefix(url: str) -> tuple[str, str]:
     """
     rest = url.removeprefix("s3://").rstrip("/")
     if "@" in rest or "?" in rest:
-        rule = "the URL of a database must not contain credentials or options"
-        raise InputError(Fault("s3://...", rule, "some", CURE_NO_KEYS))
+        raise input_error(
+            "s3://...",
+            "the URL of a database must not contain credentials or options",
+            "some",
+            CURE_NO_KEYS,
+        )
     bucket, _, prefix = rest.partition("/")
     parts = prefix.split("/") if prefix else []
     usable = all(
@@ -76,7 +80,7 @@ def bucket_and_prefix(url: str) -> tuple[str, str]:
             "must be s3://BUCKET/PREFIX of lower-case letters, digits, '.', '-'; "
             "PREFIX also of capitals, '_', '='"
         )
-        raise InputError(Fault(url, rule, "a different form", "choose another name"))
+        raise input_error(url, rule, "a different form", "choose another name")
     return bucket, prefix
 
 
@@ -95,10 +99,11 @@ def connect(bucket: str, prefix: str) -> S3Store:
         from obstore.exceptions import BaseError
         from obstore.store import S3Store
     except ImportError:
-        rule = "a database in a bucket needs obstore"
-        cure = "pip install 'skindb[s3]'"
-        raise InputError(
-            Fault(f"s3://{bucket}", rule, "it is not installed", cure)
+        raise input_error(
+            f"s3://{bucket}",
+            "a database in a bucket needs obstore",
+            "it is not installed",
+            "pip install 'skindb[s3]'",
         ) from None
     settings: dict[str, Any] = {"endpoint": endpoint()} if endpoint() else {}
     if (
@@ -111,8 +116,8 @@ def connect(bucket: str, prefix: str) -> S3Store:
             settings["credential_provider"] = _profile_credentials
         elif not _is_on_aws():
             # without the metadata service of AWS the request times out after a minute
-            raise InputError(
-                Fault(f"s3://{bucket}", "credentials must be set", "none", CURE_NO_KEYS)
+            raise input_error(
+                f"s3://{bucket}", "credentials must be set", "none", CURE_NO_KEYS
             )
     pauses: BackoffConfig = {
         "init_backoff": FIRST_PAUSE,
@@ -137,10 +142,11 @@ def connect(bucket: str, prefix: str) -> S3Store:
         )
     except (BaseError, ValueError, TypeError):
         # the text of the error may contain secret values of variables
-        rule = "the AWS_ variables must have valid values"
-        cure = "correct them"
-        raise InputError(
-            Fault(f"s3://{bucket}", rule, "an invalid value", cure)
+        raise input_error(
+            f"s3://{bucket}",
+            "the AWS_ variables must have valid values",
+            "an invalid value",
+            "correct them",
         ) from None
 
 
@@ -161,18 +167,24 @@ def endpoint() -> str:
     parts = urlsplit(address)
     host = parts.hostname or ""
     if not re.fullmatch(r"https?://[^@/?#]+/?", address) or not host:
-        rule = "must be http(s)://HOST:PORT without credentials"
-        cure = "correct it"
-        raise InputError(Fault("AWS_ENDPOINT_URL", rule, "a different URL", cure))
+        raise input_error(
+            "AWS_ENDPOINT_URL",
+            "must be http(s)://HOST:PORT without credentials",
+            "a different URL",
+            "correct it",
+        )
     loopback = host in ("localhost", "::1") or host.startswith("127.")
     if (
         parts.scheme == "http"
         and not loopback
         and os.environ.get("AWS_ALLOW_HTTP", "").lower() not in ("1", "true")
     ):
-        rule = "data of subjects must be encrypted when they are sent over a network"
-        cure = "use https, or set AWS_ALLOW_HTTP=true in a private network"
-        raise InputError(Fault("AWS_ENDPOINT_URL", rule, f"http to {host}", cure))
+        raise input_error(
+            "AWS_ENDPOINT_URL",
+            "data of subjects must be encrypted when they are sent over a network",
+            f"http to {host}",
+            "use https, or set AWS_ALLOW_HTTP=true in a private network",
+        )
     return address.rstrip("/")
 
 
@@ -196,11 +208,12 @@ def readable_errors(location: str) -> Iterator[None]:
     if not _OBSTORE_PROCESS:
         _OBSTORE_PROCESS.append(os.getpid())
     elif _OBSTORE_PROCESS[0] != os.getpid():
-        rule = (
-            "a process that uses a bucket must not be forked from another one that does"
+        raise input_error(
+            location,
+            "a process that uses a bucket must not be forked from another one that does",
+            "a forked process",
+            "use the workers of skindb, loky or Dask, or the start method spawn",
         )
-        cure = "use the workers of skindb, loky or Dask, or the start method spawn"
-        raise InputError(Fault(location, rule, "a forked process", cure))
     try:
         yield
     except AlreadyExistsError:
@@ -280,16 +293,20 @@ def _profile() -> dict[str, str]:
             parser.read(path, encoding="utf-8")
         except (configparser.Error, UnicodeDecodeError):
             # the text of the error repeats lines of the file
-            rule = "must be a configuration file of the AWS command line"
-            cure = "correct it"
-            raise InputError(
-                Fault(str(path), rule, "lines that cannot be parsed", cure)
+            raise input_error(
+                str(path),
+                "must be a configuration file of the AWS command line",
+                "lines that cannot be parsed",
+                "correct it",
             ) from None
         settings |= dict(parser[title]) if title in parser else {}
     if name and not settings:
-        rule = "must name a profile of the AWS configuration"
-        cure = "correct it, or unset it"
-        raise InputError(Fault("AWS_PROFILE", rule, repr(name), cure))
+        raise input_error(
+            "AWS_PROFILE",
+            "must name a profile of the AWS configuration",
+            repr(name),
+            "correct it, or unset it",
+        )
     return settings
 
 

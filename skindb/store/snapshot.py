@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 from skindb.schema.consent import CONSENT, consent_scope
 from skindb.store.log import GENERATION, Log
 from skindb.store.markers import Markers, WithdrawnError, read_markers
@@ -322,9 +322,12 @@ def consent_of(records: Records, take: str) -> tuple[str, ...]:
 def pins_of(records: Records, release: str) -> Pins:
     """The versions that a release names; `InputError` if the release does not exist."""
     if not records.has(RELEASE, release):
-        finding = f"releases: {', '.join(records.takes(RELEASE)) or 'none'}"
-        rule = "the release must exist"
-        raise InputError(Fault(release, rule, finding, "see skindb release"))
+        raise input_error(
+            release,
+            "the release must exist",
+            f"releases: {', '.join(records.takes(RELEASE)) or 'none'}",
+            "see skindb release",
+        )
     named = records.record(RELEASE, release).made_from
     return {(pin["kind"], pin["take"]): pin for pin in named}
 
@@ -333,17 +336,21 @@ def pinned_record(records: Records, pins: Pins, kind: str, take: str) -> Record:
     """The record of the version that a release names for a take."""
     if (kind, take) not in pins:
         takes = sorted(name for pinned_kind, name in pins if pinned_kind == kind)
-        rule = f"the release must name a {kind} of this take"
-        finding = f"takes: {', '.join(takes) or 'none'}"
-        raise InputError(Fault(take, rule, finding, "choose one of these"))
+        raise input_error(
+            take,
+            f"the release must name a {kind} of this take",
+            f"takes: {', '.join(takes) or 'none'}",
+            "choose one of these",
+        )
     pin = pins[kind, take]
     record = records.record(kind, take, pin["generation"])
     if record.seal != pin["seal"]:
-        rule = (
-            f"generation {pin['generation']} of its {kind} must be that of the release"
+        raise input_error(
+            take,
+            f"generation {pin['generation']} of its {kind} must be that of the release",
+            "a different version",
+            "restore it from a backup",
         )
-        cure = "restore it from a backup"
-        raise InputError(Fault(take, rule, "a different version", cure))
     return record
 
 

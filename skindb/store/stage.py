@@ -19,7 +19,7 @@ import zarr
 from zarr.codecs import BloscCodec, TransposeCodec
 
 from skindb import __version__
-from skindb.errors import Fault, InputError, add_filename
+from skindb.errors import Fault, InputError, add_filename, input_error
 from skindb.files import plain
 from skindb.schema import SCHEMA_VERSION, VARIABLES, check, dataset
 from skindb.schema.label import SHARD
@@ -280,10 +280,12 @@ class Stage:
             name for name in sorted(self.groups) if f"{name}/zarr.json" not in sizes
         ]
         if gone:
-            rule = "all groups of a version must exist when it is committed"
-            finding = f"that another process removed {', '.join(gone)}"
-            cure = "run the command again"
-            raise InputError(Fault(self.log.what, rule, finding, cure))
+            raise input_error(
+                self.log.what,
+                "all groups of a version must exist when it is committed",
+                f"that another process removed {', '.join(gone)}",
+                "run the command again",
+            )
         return {
             name: (self.place.digest(f"{self.path}/{name}"), size)
             for name, size in sorted(sizes.items())
@@ -305,12 +307,11 @@ class Stage:
         take = self.log.take
         unnamed = sorted({*takes} - {*self.names} - own_takes(kind, take))
         if kind not in KINDS_OF_ONE_SUBJECT and unnamed:
-            rule = (
-                "a version must name the takes that it refers to before it is written"
-            )
-            cure = f"call db.stage({kind!r}, {take!r}, names=[...])"
-            raise InputError(
-                Fault(self.log.what, rule, f"no {', '.join(unnamed[:8])}", cure)
+            raise input_error(
+                self.log.what,
+                "a version must name the takes that it refers to before it is written",
+                f"no {', '.join(unnamed[:8])}",
+                f"call db.stage({kind!r}, {take!r}, names=[...])",
             )
 
     def _admissions(self) -> dict[str, int]:

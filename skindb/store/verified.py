@@ -24,7 +24,7 @@ from zarr.abc.store import (
 )
 from zarr.core.buffer import Buffer, BufferPrototype
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 from skindb.schema.label import SHARD
 from skindb.store.place import Place
 from skindb.store.record import Record, json_object
@@ -80,7 +80,7 @@ def read_beside(place: Place, record: Record, suffix: str, digest: str) -> bytes
         )
         raise InputError(fault) from None
     if hashlib.sha256(text).hexdigest() != digest:
-        raise InputError(Fault(place.where(key), AS_COMMITTED, CHANGED, CURE))
+        raise input_error(place.where(key), AS_COMMITTED, CHANGED, CURE)
     return text
 
 
@@ -231,9 +231,11 @@ class VerifiedStore(ListedStore):
         """Raise an `InputError` for metadata that do not match the chunk files."""
         if finding := metadata_faults(content, self._chunks[key.rpartition("/")[0]]):
             location = self.place.where(f"{self.record.path}/{key}")
-            rule = "the metadata of an array must match its files"
-            raise InputError(
-                Fault(location, rule, finding, "compute the version again")
+            raise input_error(
+                location,
+                "the metadata of an array must match its files",
+                finding,
+                "compute the version again",
             )
 
     def _require_files(self) -> None:

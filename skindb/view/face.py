@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.geometry.mesh import vertex_areas
 from skindb.optics.diffusion import S_FLOOR
 from skindb.optics.fresnel import boundary_factor
@@ -215,9 +215,12 @@ def face_record(
     surface = _surface(model, edited=bool(traits))[0]
     resampled, weights = surface.model.resample(surface.parameters)
     if (count := weights.shape[1]) > MAX_TABLES:
-        rule = f"the viewer needs at most {MAX_TABLES} bases"
-        cure = f"fit again with --k {MAX_TABLES} or less"
-        raise InputError(Fault(take, rule, str(count), cure))
+        raise input_error(
+            take,
+            f"the viewer needs at most {MAX_TABLES} bases",
+            str(count),
+            f"fit again with --k {MAX_TABLES} or less",
+        )
     values = _values(surface, weights)
     uv = model["fitted"].to_dataset()[variables.SURFEL_UV].values.astype(np.float32)
     tables = _tables(resampled)

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error, require
 from skindb.format.fields import read_json
 from skindb.format.scan_checks import (
     coincidence_faults,
@@ -92,10 +92,13 @@ def landmark_task(scan_path: Path, out: Path) -> LandmarkTask:
     InputError
         If the scan or one of the files cannot be read, or the folder of `out` does not exist.
     """
-    if not out.parent.is_dir():
-        raise InputError(
-            Fault(str(out), "its folder must exist", "none", f"create {out.parent}")
-        )
+    require(
+        out.parent.is_dir(),
+        str(out),
+        "its folder must exist",
+        "none",
+        f"create {out.parent}",
+    )
     scan = read_scan(scan_path)
     surface = clean_mesh(scan.vertices, scan.faces)
     colours = read_colours(scan_path, len(scan.vertices))
@@ -135,13 +138,11 @@ def parsed_points(value: Any, file: str) -> dict[str, Float64]:
         If the value is not an object, or a position is not three finite numbers.
     """
     if not isinstance(value, dict):
-        raise InputError(
-            Fault(
-                file,
-                "must be a JSON object {name: [x, y, z]}",
-                type(value).__name__,
-                "correct it",
-            )
+        raise input_error(
+            file,
+            "must be a JSON object {name: [x, y, z]}",
+            type(value).__name__,
+            "correct it",
         )
     rule = "a landmark must be [x, y, z] in mm"
     cure = "correct it, or remove it"

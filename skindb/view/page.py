@@ -19,7 +19,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from skindb.errors import Fault, InputError, system_fault
+from skindb.errors import InputError, input_error, system_fault
 from skindb.files import make_private, private_file
 
 SCRIPTS = (
@@ -114,9 +114,12 @@ def write_page(
         surroundings,
     )
     if (size := len(text.encode())) > MAX_PAGE_BYTES:
-        rule = f"a page must have at most {MAX_PAGE_BYTES // 1_000_000} MB"
-        cure = "fit with a larger --spacing"
-        raise InputError(Fault(str(out), rule, f"{size / 1e6:.0f} MB", cure))
+        raise input_error(
+            str(out),
+            f"a page must have at most {MAX_PAGE_BYTES // 1_000_000} MB",
+            f"{size / 1e6:.0f} MB",
+            "fit with a larger --spacing",
+        )
     private_file(out).write_text(text, encoding="utf-8")
     return size
 
@@ -233,11 +236,11 @@ class PageServer(ThreadingHTTPServer):
         try:
             super().__init__((LOCAL, port), _Handler)
         except OSError as error:
-            cure = "choose another port, or omit --port"
-            raise InputError(
-                Fault(
-                    f"port {port}", "must be free", error.strerror or str(error), cure
-                )
+            raise input_error(
+                f"port {port}",
+                "must be free",
+                error.strerror or str(error),
+                "choose another port, or omit --port",
             ) from None
 
     @property

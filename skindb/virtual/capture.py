@@ -17,7 +17,7 @@ import trimesh
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.files import make_private, private_file
 from skindb.geometry.rays import RayScene
 from skindb.optics.diffusion import dipole_s
@@ -288,13 +288,11 @@ class _Steps:
 
 def _require_empty(out: Path) -> None:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(
-            Fault(
-                str(out),
-                "a new capture needs an absent or empty folder",
-                "existing files",
-                "choose another folder",
-            )
+        raise input_error(
+            str(out),
+            "a new capture needs an absent or empty folder",
+            "existing files",
+            "choose another folder",
         )
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.interpolate import RectBivariateSpline
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error, require
 from skindb.geometry.mesh import subdivide, vertex_normals
 from skindb.types import Float64, Index, Mask
 from skindb.virtual.face import (
@@ -260,8 +260,7 @@ def load_head(path: Path) -> HeadModel:
     HeadModel
         Raises `InputError` for a file that is none of these.
     """
-    if not path.is_file():
-        raise InputError(Fault(str(path), "head model file must exist", "no file"))
+    require(path.is_file(), str(path), "head model file must exist", "no file")
     if path.suffix.lower() != ".npz":
         mesh = trimesh.load(path, process=False, maintain_order=True, force="mesh")
         return _checked(
@@ -272,19 +271,17 @@ def load_head(path: Path) -> HeadModel:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
     except (BadZipFile, ValueError, OSError) as error:
-        raise InputError(
-            Fault(str(path), "head model must be a readable npz archive", str(error))
+        raise input_error(
+            str(path), "head model must be a readable npz archive", str(error)
         ) from error
     if "v0" in arrays:
         return _checked(path, _population(arrays))
     if not {"vertices", "faces"} <= arrays.keys():
         names = ", ".join(sorted(arrays)) or "nothing"
-        raise InputError(
-            Fault(
-                str(path),
-                "head model needs the arrays vertices and faces, or v0 and quads",
-                names,
-            )
+        raise input_error(
+            str(path),
+            "head model needs the arrays vertices and faces, or v0 and quads",
+            names,
         )
     return _checked(path, _plain(arrays))
 

@@ -16,7 +16,7 @@ import imagecodecs
 import numpy as np
 
 from skindb.clock import Clock, SimulatedClock
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.types import Float64, Index
 from skindb.virtual.devices import (
     GAUGE_FAULTS,
@@ -302,7 +302,7 @@ def laboratory_faults(
                 "numbers are not negative, probabilities at most 1, lights and cameras "
                 "those of the set-up"
             )
-            raise InputError(Fault("--fault", rule, repr(text), cure)) from None
+            raise input_error("--fault", rule, repr(text), cure) from None
     if not texts:
         return None
     dome = DeviceFaults(**devices["dome"])

@@ -18,7 +18,7 @@ from functools import partial, wraps
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
-from skindb.errors import Fault, InputError, SkindbWarning
+from skindb.errors import InputError, SkindbWarning, input_error
 
 if TYPE_CHECKING:
     from skindb.store import Database
@@ -249,5 +249,5 @@ def _checked_actor(source: str, actor: str) -> str:
             f"must be 1 to {MAX_ACTOR_CHARACTERS} characters that can be printed, "
             "without spaces around them"
         )
-        raise InputError(Fault(source, rule, repr(actor)[:200], "choose another name"))
+        raise input_error(source, rule, repr(actor)[:200], "choose another name")
     return actor

@@ -28,7 +28,7 @@ from skindb.calibration.setup import (
     read_flat_frames,
     read_setup_dome,
 )
-from skindb.errors import Fault, InputError, add_filename, require
+from skindb.errors import Fault, InputError, add_filename, input_error, require
 from skindb.files import private_file
 from skindb.format.dome import DomeRecord
 from skindb.format.fields import NAME, read_json
@@ -297,10 +297,12 @@ def calibrated_capture(db: Database, capture: Capture) -> Capture:
         return capture
     if not db.has(CALIBRATION, name):
         names = ", ".join(db.takes(CALIBRATION)) or "none"
-        source = f"{capture.folder / 'capture.json'}[calibration]"
-        rule = "the database must hold the calibration that it names"
-        finding = f"{name}; calibrations: {names}"
-        raise InputError(Fault(source, rule, finding, "run skindb calibrate first"))
+        raise input_error(
+            f"{capture.folder / 'capture.json'}[calibration]",
+            "the database must hold the calibration that it names",
+            f"{name}; calibrations: {names}",
+            "run skindb calibrate first",
+        )
     record = db.record(CALIBRATION, name)
     stored = db.read(CALIBRATION, name, generation=record.generation)
     groups = {group: child.to_dataset() for group, child in stored.children.items()}

@@ -31,7 +31,7 @@ from skindb.analysis.summary import (
     sample_surfels,
     summary_tables,
 )
-from skindb.errors import Fault, InputError, require
+from skindb.errors import require
 from skindb.fit import prediction_table
 from skindb.schema import FitStatus, dataset, variables
 from skindb.schema.consent import require_consent
@@ -267,10 +267,13 @@ def register_takes(
     for take in takes or ():
         require_consent({"consent_scope": db.consent(take), "take": take}, "statistics")
     names = sorted(takes_with_landmarks(db, takes))
-    if not names:
-        finding = "no take has any"
-        cure = "name the 20 points in the capture's landmarks.json"
-        raise InputError(Fault(db.url, "a registration needs landmarks", finding, cure))
+    require(
+        names,
+        db.url,
+        "a registration needs landmarks",
+        "no take has any",
+        "name the 20 points in the capture's landmarks.json",
+    )
     models = {take: db.record("model", take) for take in names}
     derivation = _derivation(db, models.values(), reference or "")
     stored = {take: replace(derivation, key=take).current() for take in names}

@@ -14,7 +14,7 @@ import xarray as xr
 from skindb.analysis.brdf import population_basis
 from skindb.analysis.edit import apply_traits, with_basis
 from skindb.analysis.summary import SAMPLED, common_maps
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.files import plain
 from skindb.reflectance.dictionary import embedded_dictionary
 from skindb.reflectance.kinds import require_mixture
@@ -340,5 +340,5 @@ def _trait_study(db: Database, name: str | None) -> str:
         cure = "run: skindb analyze DB traits"
         if stored:
             cure = "name one of them with --study"
-        raise InputError(Fault(f"study {study}", rule, finding, cure))
+        raise input_error(f"study {study}", rule, finding, cure)
     return study

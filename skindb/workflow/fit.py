@@ -11,7 +11,7 @@ from typing import Any
 
 import xarray as xr
 
-from skindb.errors import Fault, InputError
+from skindb.errors import InputError, input_error
 from skindb.fit import FitParameters, FitPlan, first_pass, plan_fit, second_pass
 from skindb.reflectance.brdf_files import read_dictionary
 from skindb.reflectance.dictionary import EMBEDDED, Dictionary, embedded_dictionary
@@ -271,10 +271,12 @@ def parameters_of(
         return FitParameters(**changes)
     model = db.record("model", take).provenance
     if dictionary is None and model.get("dictionary", EMBEDDED) != EMBEDDED:
-        rule = "a fit keeps the dictionary of the take's model"
-        finding = f"no dictionary for a model made with {model['dictionary']!r}"
-        cure = f"name it with --dictionary, or give --dictionary {EMBEDDED_NAME}"
-        raise InputError(Fault(take, rule, finding, cure))
+        raise input_error(
+            take,
+            "a fit keeps the dictionary of the take's model",
+            f"no dictionary for a model made with {model['dictionary']!r}",
+            f"name it with --dictionary, or give --dictionary {EMBEDDED_NAME}",
+        )
     return FitParameters(**{**_values_of_model(model, changes), **changes})
 
 

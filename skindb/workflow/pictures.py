@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb.errors import Fault, InputError
+from skindb.errors import InputError, input_error
 from skindb.export.bundle import export_bundle
 from skindb.export.gltf import export_gltf
 from skindb.files import make_private
@@ -125,8 +125,8 @@ def show_take(
     }
     if not trees:
         takes = ", ".join(db.takes("capture")) or "there is none"
-        raise InputError(
-            Fault("take", "a take of the database is drawn", take, f"choose {takes}")
+        raise input_error(
+            "take", "a take of the database is drawn", take, f"choose {takes}"
         )
     require_consent({"consent_scope": db.consent(take), "take": take}, "export")
     return write_field(trees, variable, out, at=at)
@@ -191,9 +191,12 @@ def _require_outside(db: Database, out: Path) -> None:
         out.resolve(),
         *out.resolve().parents,
     ):
-        rule = "pictures and exports are written outside of the database"
-        cure = "choose another folder"
-        raise InputError(Fault(str(out), rule, f"a place inside {db.url}", cure))
+        raise input_error(
+            str(out),
+            "pictures and exports are written outside of the database",
+            f"a place inside {db.url}",
+            "choose another folder",
+        )
 
 
 @logged("render")
@@ -236,9 +239,12 @@ def translucency_grid(
     """
     lengths = _diffusion_lengths(db, site)
     if len(lengths) < 2:
-        rule = f"two takes must have translucency at {site}"
-        cure = "name another site, or fit more takes"
-        raise InputError(Fault(db.url, rule, f"{len(lengths)}", cure))
+        raise input_error(
+            db.url,
+            f"two takes must have translucency at {site}",
+            f"{len(lengths)}",
+            "name another site, or fit more takes",
+        )
     chosen = [
         min(lengths, key=lengths.__getitem__),
         max(lengths, key=lengths.__getitem__),
@@ -436,13 +442,11 @@ def view_server(
     def data(take: str) -> bytes:
         face = _permitted(db, faces, take)
         if face is None:
-            raise InputError(
-                Fault(
-                    take,
-                    "its subject must consent to exports",
-                    "no such consent",
-                    "show another take",
-                )
+            raise input_error(
+                take,
+                "its subject must consent to exports",
+                "no such consent",
+                "show another take",
             )
         return face.data
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from skindb.calibration.setup import read_setup_dome
 from skindb.clock import SYSTEM_CLOCK, Clock, SimulatedClock
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 from skindb.files import make_private, private_umask
 from skindb.format.fields import IDENTIFIER, read_json
 from skindb.format.folder import read_capture, record_faults
@@ -278,9 +278,12 @@ def _plan(setup: Setup, parameters: SessionParameters) -> CapturePlan:
         probe = setup.probe or {}
         measured = tuple(map(str, probe.get("sites", ())))
         if unknown := [name for name in sites if name not in measured]:
-            rule = f"the virtual subject has the sites {', '.join(measured)}"
-            cure = "name one of these"
-            raise InputError(Fault("--sites", rule, ", ".join(unknown), cure))
+            raise input_error(
+                "--sites",
+                f"the virtual subject has the sites {', '.join(measured)}",
+                ", ".join(unknown),
+                "name one of these",
+            )
         sites = sites or measured
     return CapturePlan(
         parameters.seconds,
@@ -414,8 +417,12 @@ def _laboratory(
             "cameras deliver"
         )
         frames = "no dome" if dome is None else dome.frames
-        cure = "name another capture; skindb simulate writes some"
-        raise InputError(Fault("--setup", rule, f"{frames} in {subject}", cure))
+        raise input_error(
+            "--setup",
+            rule,
+            f"{frames} in {subject}",
+            "name another capture; skindb simulate writes some",
+        )
     setup = read_setup(subject)
     faults = laboratory_faults(parameters.faults, setup.lights, setup.cameras)
     watched = beside / "frames"

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 from skindb.files import make_private, private_file, read_regular
 from skindb.parameters import SimulationParameters
 from skindb.types import Progress
@@ -106,12 +106,19 @@ def begin_cohort(
             if stored.get(name) != options.get(name)
         ]
         if differ:
-            rule = "a cohort is continued with the same options"
-            cure = "give them, or choose another folder"
-            raise InputError(Fault(str(note), rule, ", ".join(differ), cure))
+            raise input_error(
+                str(note),
+                "a cohort is continued with the same options",
+                ", ".join(differ),
+                "give them, or choose another folder",
+            )
     elif out.is_dir() and any(out.iterdir()):
-        rule = "a new cohort needs an absent or empty folder"
-        raise InputError(Fault(str(out), rule, "something there", "choose another"))
+        raise input_error(
+            str(out),
+            "a new cohort needs an absent or empty folder",
+            "something there",
+            "choose another",
+        )
     else:
         make_private(out)
         private_file(note).write_text(json.dumps(options, indent=1), encoding="utf-8")

@@ -22,7 +22,7 @@ from skindb.analysis.registration import describe_registration
 from skindb.analysis.studies import STUDIES
 from skindb.analysis.study import Population, Study
 from skindb.analysis.subjects import CONDITION, subjects_of, subjects_without_normal
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.parameters import option_of, require_limits
 from skindb.reflectance.brdf_files import read_dictionary
 from skindb.reflectance.dictionary import convolve_disc, embedded_dictionary
@@ -65,11 +65,12 @@ def dictionary_tables(
         embedded_dictionary() if dictionary is None else read_dictionary(dictionary)
     )
     if list(stored.names) != list(names):
-        source = "dictionary"
-        rule = "must be the one the takes were fitted with"
-        finding = f"{len(names)} BRDFs, {names[0]} first"
-        cure = "name its folder with --dictionary"
-        raise InputError(Fault(source, rule, finding, cure))
+        raise input_error(
+            "dictionary",
+            "must be the one the takes were fitted with",
+            f"{len(names)} BRDFs, {names[0]} first",
+            "name its folder with --dictionary",
+        )
     return convolve_disc(stored, disc).table
 
 
@@ -150,10 +151,12 @@ def _open_maps(
 ) -> xr.Dataset:
     """Maps of the registered takes; without a probe there is no map of sigma_tr."""
     if not registered:
-        rule = "maps need registered takes"
-        finding = f"none of {models.sizes['take']} takes has landmarks"
-        cure = "add landmarks to the captures, then ingest and fit them"
-        raise InputError(Fault(db.url, rule, finding, cure))
+        raise input_error(
+            db.url,
+            "maps need registered takes",
+            f"none of {models.sizes['take']} takes has landmarks",
+            "add landmarks to the captures, then ingest and fit them",
+        )
     maps = open_maps()
     skipped = [*models.attrs["skipped"], *maps.attrs["skipped"]]
     return maps.assign_attrs(skipped=unique_notes(skipped))
@@ -207,9 +210,12 @@ def require_covered(db: Database, release: str | None) -> None:
         if reason.why != "superseded"
     ]
     if causes := list(dict.fromkeys(map(str, reasons))):
-        rule = "the registrations of a release must be covered by consent"
-        cure = "run skindb refresh, and make another release"
-        raise InputError(Fault(f"release {release}", rule, "; ".join(causes), cure))
+        raise input_error(
+            f"release {release}",
+            "the registrations of a release must be covered by consent",
+            "; ".join(causes),
+            "run skindb refresh, and make another release",
+        )
 
 
 def _registrations(
@@ -366,9 +372,11 @@ STUDY_FUNCTIONS = {name: study_function(record) for name, record in STUDIES.item
 
 def _record(what: str) -> Study:
     if what not in STUDIES:
-        cure = f"choose from {', '.join(STUDIES)}"
-        raise InputError(
-            Fault(f"study {what}", "must be a known study", "another name", cure)
+        raise input_error(
+            f"study {what}",
+            "must be a known study",
+            "another name",
+            f"choose from {', '.join(STUDIES)}",
         )
     return STUDIES[what]
 
@@ -378,13 +386,17 @@ def _parameters(record: Study, options: Mapping[str, Any]) -> Any:
     specs = {spec.name: spec for spec in fields(record.parameters)}
     place = f"study {record.name}"
     if unknown := sorted(options.keys() - specs.keys()):
-        rule = f"its parameters are {', '.join(specs) or 'none'}"
-        raise InputError(Fault(place, rule, ", ".join(unknown), "omit the others"))
+        raise input_error(
+            place,
+            f"its parameters are {', '.join(specs) or 'none'}",
+            ", ".join(unknown),
+            "omit the others",
+        )
     required = [name for name, spec in specs.items() if spec.default is MISSING]
     if missing := [name for name in required if options.get(name) is None]:
         names = " and ".join(missing)
-        raise InputError(
-            Fault(place, f"needs {names}", "none", f"give {names}, such as 'gender'")
+        raise input_error(
+            place, f"needs {names}", "none", f"give {names}, such as 'gender'"
         )
     chosen = dict(options)
     if isinstance(chosen.get("adjust"), str):

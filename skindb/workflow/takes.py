@@ -39,7 +39,7 @@ from loky.process_executor import BrokenProcessPool
 
 from skindb import __version__
 from skindb.elementwise import thread_count
-from skindb.errors import Fault, InputError, system_fault
+from skindb.errors import Fault, InputError, input_error, require, system_fault
 from skindb.files import make_private, private_file
 from skindb.threads import one_blas_thread
 from skindb.workflow.audit import as_part
@@ -293,20 +293,19 @@ class Expected:
             rule = f"must run the same skindb as this process ({self.version})"
             finding = f"version {__version__}"
             finding += "" if __version__ != self.version else " with other source code"
-            raise InputError(
-                Fault(
-                    f"worker {worker}",
-                    rule,
-                    finding,
-                    "install the same version, restart the worker",
-                )
+            raise input_error(
+                f"worker {worker}",
+                rule,
+                finding,
+                "install the same version, restart the worker",
             )
         if self.token and not Path(self.token).is_file():
             folder = str(Path(self.token).parent.parent)
-            rule = f"must see the database {folder}"
-            cure = "use a folder that all machines share"
-            raise InputError(
-                Fault(f"worker {worker}", rule, "no such folder, or another one", cure)
+            raise input_error(
+                f"worker {worker}",
+                f"must see the database {folder}",
+                "no such folder, or another one",
+                "use a folder that all machines share",
             )
 
 
@@ -328,9 +327,12 @@ def connected(address: str) -> Iterator[Client]:
     try:
         from distributed import Client
     except ImportError as error:
-        rule = "needs the package distributed"
-        cure = "run: pip install 'skindb[cluster]'"
-        raise InputError(Fault("--scheduler", rule, str(error), cure)) from None
+        raise input_error(
+            "--scheduler",
+            "needs the package distributed",
+            str(error),
+            "run: pip install 'skindb[cluster]'",
+        ) from None
     try:
         url = (
             json.loads(Path(address).read_text())["address"]
@@ -342,15 +344,11 @@ def connected(address: str) -> Iterator[Client]:
         client = Client(url, timeout=CONNECT_SECONDS, set_as_default=False)
     # of any kind: the file and the server are not ours
     except Exception as error:  # noqa: BLE001
-        rule = "a Dask scheduler must answer there"
-        cure = "check the address, and that `dask scheduler` runs"
-        raise InputError(
-            Fault(
-                address,
-                rule,
-                f"{type(error).__name__}: {str(error) or 'no answer'}",
-                cure,
-            )
+        raise input_error(
+            address,
+            "a Dask scheduler must answer there",
+            f"{type(error).__name__}: {str(error) or 'no answer'}",
+            "check the address, and that `dask scheduler` runs",
         ) from None
     with client:
         yield client
@@ -401,15 +399,19 @@ def _require_workers(client: Client, expected: Expected) -> None:
         raise
     # workers without skindb, or that were lost
     except Exception as error:  # noqa: BLE001
-        rule = "every worker must have skindb and answer"
-        cure = "install it in the environment of the workers"
-        raise InputError(
-            Fault("cluster", rule, f"{type(error).__name__}: {error}", cure)
+        raise input_error(
+            "cluster",
+            "every worker must have skindb and answer",
+            f"{type(error).__name__}: {error}",
+            "install it in the environment of the workers",
         ) from None
-    if not checked:
-        rule = "a study needs workers"
-        cure = "start one: dask worker ADDRESS"
-        raise InputError(Fault("cluster", rule, "the scheduler has none", cure))
+    require(
+        checked,
+        "cluster",
+        "a study needs workers",
+        "the scheduler has none",
+        "start one: dask worker ADDRESS",
+    )
 
 
 def _checked(expected: Expected, dask_worker: Worker) -> bool:
@@ -530,13 +532,19 @@ def _outcome_of(
         raise
     except CancelledError:
         url = str(client.scheduler.address if client.scheduler else "the scheduler")
-        rule = "the scheduler must answer until the work is done"
-        cure = "start it, and run the command again"
-        raise InputError(Fault(url, rule, "the connection was lost", cure)) from None
+        raise input_error(
+            url,
+            "the scheduler must answer until the work is done",
+            "the connection was lost",
+            "start it, and run the command again",
+        ) from None
     except ImportError as error:
-        rule = "every worker must have skindb"
-        cure = "install it in the environment of the workers"
-        raise InputError(Fault("cluster", rule, str(error), cure)) from None
+        raise input_error(
+            "cluster",
+            "every worker must have skindb",
+            str(error),
+            "install it in the environment of the workers",
+        ) from None
     except KilledWorker:
         return Outcome(take, error=KilledError(take))
     # the call could not be sent

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from skindb.analysis.studies import STUDIES
-from skindb.errors import Fault, InputError
+from skindb.errors import InputError, input_error, require
 from skindb.store import (
     RELEASE,
     STUDY,
@@ -162,17 +162,16 @@ def repeat_study(
     name = key.partition(".")[2]
     rule = "a study must be one that this version of skindb can compute"
     cure = "run skindb analyze"
-    if study_name not in STUDIES:
-        raise InputError(Fault(key, rule, f"the study {study_name!r}", cure))
+    require(study_name in STUDIES, key, rule, f"the study {study_name!r}", cure)
     accepted = {spec.name for spec in fields(STUDIES[study_name].parameters)}
     if unknown := sorted(options.keys() - {*accepted, "takes", "release"}):
-        raise InputError(Fault(key, rule, f"the parameters {', '.join(unknown)}", cure))
+        raise input_error(key, rule, f"the parameters {', '.join(unknown)}", cure)
     release = options.pop("release", "") or None
     takes = options.pop("takes", [])
     stored = set(db.takes("model", release=release))
     if takes and not stored & set(takes):
-        raise InputError(
-            Fault(key, "a study needs fitted takes", "no version of it is left", cure)
+        raise input_error(
+            key, "a study needs fitted takes", "no version of it is left", cure
         )
     options |= {
         "takes": [take for take in takes if take in stored],
@@ -214,18 +213,13 @@ def _repeat_release(db: Database, request: Request) -> Record:
     """
     pins = request.parameters.get("pins") or db.record(RELEASE, request.take).made_from
     models = {pin["take"]: pin["seal"] for pin in pins if pin["kind"] == "model"}
-    if any(waiting.kind == "registration" for waiting in db.requests()):
-        rule = (
-            "the registrations of a release must be computed before its next revision"
-        )
-        raise InputError(
-            Fault(
-                str(request),
-                rule,
-                "that they could not be computed yet",
-                "run skindb refresh",
-            )
-        )
+    require(
+        not any(waiting.kind == "registration" for waiting in db.requests()),
+        str(request),
+        "the registrations of a release must be computed before its next revision",
+        "that they could not be computed yet",
+        "run skindb refresh",
+    )
     registrations = []
     for take in request.parameters.get("takes", []):
         record = (
