@@ -25,15 +25,16 @@ from scipy.spatial import cKDTree
 
 from benchmarks.truth import read_truth
 from benchmarks.truth import regions as true_regions
-from skindb.analysis import correspondence_error, mask_agreement, register
+from skindb.analysis import register
 from skindb.analysis.regions import own_masks, region_masks
-from skindb.analysis.registration import unregistered
+from skindb.analysis.registration import corresponding_points, interpolate, surface_of
 from skindb.format.folder import read_capture
 from skindb.geometry.atlas import disc_atlas
 from skindb.geometry.clean import clean_mesh
+from skindb.geometry.mesh import closest_on_mesh
 from skindb.ingest.groups import mesh_group, surfel_group
 from skindb.ingest.surfels import build_surfels
-from skindb.schema import dataset
+from skindb.schema import dataset, variables
 
 Array = NDArray[np.floating[Any]]
 Models = dict[str, xr.DataTree]
@@ -45,6 +46,68 @@ BACK = 25.0  # mm that are cut off at the back of the head
 PRESENT = 3.0  # mm from the scan; farther points are not on it
 # region from landmarks -> names of the same region in other data
 BESIDE = {"neck": ("neck", "neck_beard")}
+
+
+def correspondence_error(
+    models: Models, registered: Mapping[str, xr.Dataset], points: Mapping[str, Array]
+) -> Array:
+    """Errors of correspondences at points where the true ones are known.
+
+    Parameters
+    ----------
+    models
+        Take -> version of kind "model".
+    registered
+        From `register` of these takes, or `unregistered`.
+    points
+        Take -> (p, 3) points [mm] on or near the surface; row i is the same anatomical
+        point of every face.
+
+    Returns
+    -------
+    ndarray
+        (pair, p) distances [mm] for every ordered pair of takes, between point i of the
+        first take and the point of its surface that corresponds to point i of the
+        second; NaN where there is no corresponding point.
+    """
+    true = {}
+    common = {}
+    for take, positions in points.items():
+        position, _, faces = surface_of(models[take])
+        face, corner, _ = closest_on_mesh(position, faces, positions)
+        true[take] = interpolate(position, faces[face], corner)
+        common[take] = interpolate(
+            registered[take][variables.COMMON_UV].values, faces[face], corner
+        )
+    error = []
+    # all others at once, because every call builds a ray tracing scene
+    for b in points:
+        places = np.concatenate([common[a] for a in points if a != b])
+        matches = corresponding_points(models[b], registered[b], places).reshape(
+            len(points) - 1, -1, 3
+        )
+        error.append(np.linalg.norm(matches - true[b], axis=2))
+    return np.concatenate(error)
+
+
+def unregistered(models: Models) -> dict[str, xr.Dataset]:
+    """The texture coordinates of each take as if they were common: the baseline for the
+    errors of a registration.
+    """
+    return {
+        take: dataset({variables.COMMON_UV: surface_of(model)[1]})
+        for take, model in models.items()
+    }
+
+
+def mask_agreement(
+    mask: NDArray[np.bool_], reference: NDArray[np.bool_], area: Array
+) -> float:
+    """Area of the intersection of two masks divided by the area of their union; NaN if
+    both are empty.
+    """
+    either = float(area[mask | reference].sum())
+    return float(area[mask & reference].sum()) / either if either else float("nan")
 
 
 def scanned(folder: Path, spacing_mm: float) -> xr.DataTree:

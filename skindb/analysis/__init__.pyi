@@ -23,7 +23,6 @@ from .chromophores import (
 from .components import (
     face_components,
     mean_face,
-    plot_mean_face,
     principal_components,
 )
 from .correlations import (
@@ -45,9 +44,8 @@ from .maps import (
     plot_effect_maps,
     tabulate_effect_maps,
 )
-from .regions import mask_agreement, region_masks, take_masks
+from .regions import region_masks, take_masks
 from .registration import (
-    correspondence_error,
     corresponding_points,
     doubtful_landmarks,
     register,
@@ -85,7 +83,6 @@ __all__ = [
     "cohort_of",
     "common_maps",
     "component_correlations",
-    "correspondence_error",
     "corresponding_points",
     "coverage_report",
     "describe_basis_size",
@@ -102,7 +99,6 @@ __all__ = [
     "face_components",
     "group_effects",
     "groups_by",
-    "mask_agreement",
     "mean_face",
     "plot_albedo",
     "plot_basis_size",
@@ -114,7 +110,6 @@ __all__ = [
     "plot_group_effects",
     "plot_group_lobes",
     "plot_group_spheres",
-    "plot_mean_face",
     "plot_study",
     "plot_traits",
     "plot_translucency",

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from skindb import plots
 from skindb.analysis.study import (
     Population,
     Results,
@@ -25,14 +24,13 @@ from skindb.errors import input_error, require
 from skindb.numerics.factorise import principal_axes
 from skindb.numerics.statistics import Moments, known_mean
 from skindb.parameters import option
-from skindb.render.image import encode_srgb, tone_map
+from skindb.render.image import tone_map
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.notes import Note, note
 from skindb.types import Array, Float64, Index, Mask
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -147,18 +145,6 @@ def _subject_maps(takes: xr.Dataset, names: list[str]) -> dict[str, Array]:
                 values = np.log(np.where(is_known, values, 1.0))
             of_takes[name].append(np.where(is_known, values, np.nan))
     return {name: known_mean(np.stack(values)) for name, values in of_takes.items()}
-
-
-def plot_mean_face(face: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Plot the mean albedo in sRGB; texels with too few subjects are white."""
-    ax = ax or plots.new_axes(4, 4)
-    linear = face[variables.FACE_DIFFUSE_REFLECTANCE].values
-    encoded = encode_srgb(np.nan_to_num(linear, nan=1.0))
-    ax.imshow(encoded, extent=(0, 1, 1, 0), interpolation="nearest")
-    ax.set_xlabel("common u")
-    ax.set_ylabel("common v")
-    ax.set_title(f"geometric mean of R_d (n = {face.attrs['subjects']})", fontsize=9)
-    return ax
 
 
 def principal_components(

@@ -133,14 +133,6 @@ def take_masks(
     return landmark_masks(registered) | own_masks(model["fitted"].to_dataset())
 
 
-def mask_agreement(mask: Mask, reference: Mask, area: Array) -> float:
-    """Area of the intersection of two masks divided by the area of their union; NaN if
-    both are empty.
-    """
-    either = float(area[mask | reference].sum())
-    return float(area[mask & reference].sum()) / either if either else float("nan")
-
-
 @cache
 def _outlines() -> dict[str, dict[str, list[Corner]]]:
     """Outlines "middle" and "side" by the names of the regions.

@@ -259,7 +259,7 @@ def _sheet(model: xr.DataTree, names: list[str]) -> Sheet:
     landmark[[names.index(str(name)) for name in mesh["landmark"].values]] = (
         _landmarks_mm(model)
     )
-    return Sheet.of(*_surface(model), landmark)
+    return Sheet.of(*surface_of(model), landmark)
 
 
 def _landmark_uv(sheet: Sheet) -> Float64:
@@ -271,7 +271,7 @@ def _landmark_uv(sheet: Sheet) -> Float64:
         sheet.position, sheet.faces, sheet.landmark[is_known]
     )
     out = np.full((len(is_known), 2), np.nan)
-    out[is_known] = _interpolate(sheet.uv, sheet.faces[face], corner)
+    out[is_known] = interpolate(sheet.uv, sheet.faces[face], corner)
     return out
 
 
@@ -342,7 +342,7 @@ def corresponding_points(
     """Surface points (n, 3) [mm] of a take at common texture coordinates (n, 2); NaN
     outside its surface.
     """
-    position, _, faces = _surface(model)
+    position, _, faces = surface_of(model)
     # the map has no folds: a ray perpendicular to the plane meets the only triangle
     # that contains the point
     flat = RayScene(
@@ -353,61 +353,9 @@ def corresponding_points(
     face, corner, _ = flat.first_hit(start, np.array([[0.0, 0.0, -1.0]]))
     return np.where(
         (face >= 0)[:, None],
-        _interpolate(position, faces[np.maximum(face, 0)], corner),
+        interpolate(position, faces[np.maximum(face, 0)], corner),
         np.nan,
     )
-
-
-def correspondence_error(
-    models: Takes, registered: Registered, points: Mapping[str, Array]
-) -> Float64:
-    """Errors of correspondences at points where the true ones are known.
-
-    Parameters
-    ----------
-    models
-        Take -> version of kind "model".
-    registered
-        From `register` of these takes, or `unregistered`.
-    points
-        Take -> (p, 3) points [mm] on or near the surface; row i is the same anatomical
-        point of every face.
-
-    Returns
-    -------
-    ndarray
-        (pair, p) distances [mm] for every ordered pair of takes, between point i of the
-        first take and the point of its surface that corresponds to point i of the
-        second; NaN where there is no corresponding point.
-    """
-    true = {}
-    common = {}
-    for take, positions in points.items():
-        position, _, faces = _surface(models[take])
-        face, corner, _ = closest_on_mesh(position, faces, positions)
-        true[take] = _interpolate(position, faces[face], corner)
-        common[take] = _interpolate(
-            registered[take][variables.COMMON_UV].values, faces[face], corner
-        )
-    error = []
-    # all others at once, because every call builds a ray tracing scene
-    for b in points:
-        places = np.concatenate([common[a] for a in points if a != b])
-        matches = corresponding_points(models[b], registered[b], places).reshape(
-            len(points) - 1, -1, 3
-        )
-        error.append(np.linalg.norm(matches - true[b], axis=2))
-    return np.concatenate(error)
-
-
-def unregistered(models: Takes) -> dict[str, xr.Dataset]:
-    """The texture coordinates of each take as if they were common: the baseline for the
-    errors of a registration.
-    """
-    return {
-        take: dataset({variables.COMMON_UV: _surface(model)[1]})
-        for take, model in models.items()
-    }
 
 
 def tabulate_registration(registered: Registered) -> tuple[list[str], list[list[Any]]]:
@@ -557,7 +505,7 @@ def describe_registration(registered: Registered, takes: Iterable[str]) -> list[
     ]
 
 
-def _surface(
+def surface_of(
     model: xr.DataTree,
 ) -> tuple[Float64, Float64, Index]:
     """Positions (n, 3) in mm, texture coordinates (n, 2) and triangles (f, 3) of a take."""
@@ -570,7 +518,7 @@ def _surface(
     return position, uv, faces.astype(int)
 
 
-def _interpolate(values: Array, corners: Index, corner: Array) -> Float64:
+def interpolate(values: Array, corners: Index, corner: Array) -> Float64:
     """Values (n, c) at barycentric coordinates `corner` (n, 3) of triangles with the
     vertices `at` (n, 3).
     """

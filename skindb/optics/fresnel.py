@@ -73,13 +73,6 @@ def internal_diffuse_reflectance(eta: float) -> float:
     return float(low**2 + (passed * wt).sum())
 
 
-def internal_diffuse_reflectance_polynomial(eta: float) -> float:
-    """F_dr by the polynomial of Egan and Hilgeman (1973), which the paper uses; 0.4448
-    at eta = 1.3.
-    """
-    return -1.440 / eta**2 + 0.710 / eta + 0.668 + 0.0636 * eta
-
-
 def boundary_factor(eta: float) -> float:
     """A = (1 + F_dr) / (1 - F_dr)."""
     inside = internal_diffuse_reflectance(eta)

@@ -360,15 +360,6 @@ def random_walk(
     return Walk(radius, path, weight, batch, per_batch * BATCHES, max_path)
 
 
-def total_reflectance(
-    escapes: Walk, sigma_a: float, sigma_s_prime: float
-) -> tuple[float, float]:
-    """Diffuse reflectance per photon that enters, and its standard error from the batches."""
-    escaped = _escaped_weight(escapes, sigma_a / sigma_s_prime)
-    batch = np.bincount(escapes.batch, escaped, BATCHES) * BATCHES / escapes.packets
-    return float(batch.mean()), float(batch.std(ddof=1) / np.sqrt(BATCHES))
-
-
 def radial_profile(
     escapes: Walk, sigma_a: float, sigma_s_prime: float, edges: Array
 ) -> tuple[Array, Array]:

@@ -317,7 +317,7 @@ def _heads(
 ) -> tuple[Head, Head]:
     """The true head, and a coarser sampling of it for the scan."""
     if person.head_file is not None:
-        return head_of_file(person.head_file, person)
+        return head_of_file(person.head_file)
     shape = face_shape(person)
     coarse = max(SCAN_SPACING, 1.8 * spacing_mm)
     scan = parametric_head(

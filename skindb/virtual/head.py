@@ -30,7 +30,6 @@ from skindb.virtual.face import (
     normals,
     region_membership,
 )
-from skindb.virtual.person import Person
 
 CENTRE = np.array([0.0, -38.0, 0.0])  # the skin is star-shaped about this point
 COARSE = (76, 80)  # grid that is relaxed and then interpolated
@@ -45,12 +44,6 @@ SAME_REGION = {
     "upper_lip": "beard",
     "jaw": "beard",
     "neck_beard": "beard",
-}
-ETHNICITY = {
-    "european": "caucasian",
-    "east_asian": "asian",
-    "african": "african",
-    "south_asian": "caucasian",
 }
 # rounds of averaging over neighbours to convert labels to smooth memberships
 SOFTEN = 6
@@ -231,7 +224,7 @@ def _grid_faces(rows: int, columns: int) -> Index:
 
 @dataclass(frozen=True)
 class HeadModel:
-    """Contents of a head model file; modes are absent in a plain head."""
+    """Contents of a head model file."""
 
     vertices: Float64  # (n, 3) mm
     faces: Index  # (m, 3)
@@ -240,9 +233,6 @@ class HeadModel:
     )  # name -> vertex
     # name -> vertices
     regions: Mapping[str, Index] = dataclasses.field(default_factory=dict)
-    identity: Float64 | None = None  # (modes, n, 3) mm per standard deviation
-    # name -> (modes,) coefficients of a group's mean
-    traits: Mapping[str, Float64] = dataclasses.field(default_factory=dict)
 
 
 def load_head(path: Path) -> HeadModel:
@@ -252,8 +242,7 @@ def load_head(path: Path) -> HeadModel:
     ----------
     path
         .npz with `vertices` and `faces` (optionally `landmark_names`,
-        `landmark_vertex`, `region`, `region_names`), the npz of a morphable population
-        (`v0`, `quads`, `id_q`, `id_scale`, ...), or a mesh file (.ply, .obj).
+        `landmark_vertex`, `region`, `region_names`), or a mesh file (.ply, .obj).
 
     Returns
     -------
@@ -274,13 +263,11 @@ def load_head(path: Path) -> HeadModel:
         raise input_error(
             str(path), "head model must be a readable npz archive", str(error)
         ) from error
-    if "v0" in arrays:
-        return _checked(path, _population(arrays))
     if not {"vertices", "faces"} <= arrays.keys():
         names = ", ".join(sorted(arrays)) or "nothing"
         raise input_error(
             str(path),
-            "head model needs the arrays vertices and faces, or v0 and quads",
+            "head model needs the arrays vertices and faces",
             names,
         )
     return _checked(path, _plain(arrays))
@@ -326,29 +313,6 @@ def _plain(a: Mapping[str, NDArray[Any]]) -> HeadModel:
     )
 
 
-def _population(a: Mapping[str, NDArray[Any]]) -> HeadModel:
-    """Mean shape, identity modes, coefficients of group means; quads are split, eye and
-    mouth caps closed.
-    """
-    faces = a["quads"].astype(int)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
-    if "caps" in a:
-        faces = np.concatenate([faces, a["caps"].astype(int)])
-    identity = (
-        a["id_q"] * a["id_scale"][:, None, None].astype(float) if "id_q" in a else None
-    )
-    traits = {
-        str(n): c.astype(float)
-        for n, c in zip(a.get("trait_keys", ()), a.get("trait_coef", ()), strict=True)
-    }
-    landmarks = {
-        str(n): int(v)
-        for n, v in zip(a.get("lm20_names", ()), a.get("lm20", ()), strict=True)
-    }
-    return HeadModel(
-        a["v0"].astype(float), faces, landmarks, _regions(a), identity, traits
-    )
-
-
 def _regions(a: Mapping[str, NDArray[Any]]) -> dict[str, Index]:
     if "region" not in a:
         return {}
@@ -361,17 +325,13 @@ def _regions(a: Mapping[str, NDArray[Any]]) -> dict[str, Index]:
     return out
 
 
-def head_of_file(path: Path, person: Person) -> tuple[Head, Head]:
-    """The true head (one Loop subdivision) of `person` from a model file, and the scan
-    in the topology of the file.
-
-    For a population, the person's seed draws the identity, and gender, ancestry and age
-    shift it; a plain head is used unchanged.
+def head_of_file(path: Path) -> tuple[Head, Head]:
+    """The true head of a model file (one Loop subdivision), and the scan in the topology
+    of the file.
     """
     model = load_head(path)
-    base = _person_shape(model, person)
-    vertices, faces, matrix = subdivide(base, model.faces, 1)
-    count = len(base)
+    vertices, faces, matrix = subdivide(model.vertices, model.faces, 1)
+    count = len(model.vertices)
     soft = _membership(model)
     normals = vertex_normals(vertices, faces)
     true = Head(
@@ -386,17 +346,6 @@ def head_of_file(path: Path, person: Person) -> tuple[Head, Head]:
     return true, Head(
         vertices[:count], model.faces, normals[:count], true.landmarks, soft
     )
-
-
-def _person_shape(model: HeadModel, person: Person) -> Float64:
-    if model.identity is None:
-        return model.vertices
-    coefficient = 0.8 * person.stream(1).standard_normal(len(model.identity))
-    age = "child" if person.age < 15 else "old" if person.age > 60 else "young"
-    group = model.traits.get(f"{ETHNICITY[person.ancestry]}_{person.gender}_{age}")
-    if group is not None:
-        coefficient = coefficient + 0.6 * group
-    return np.asarray(model.vertices + np.tensordot(coefficient, model.identity, 1))
 
 
 def _membership(model: HeadModel) -> dict[str, Float64]:

@@ -67,12 +67,6 @@ def code_digest(*functions: Callable[..., Any]) -> str:
     return _digest_of(ROOT, tuple(_symbol(function) for function in functions))
 
 
-def code_symbols(*functions: Callable[..., Any]) -> list[Symbol]:
-    """The modules and names that `code_digest` covers, in order."""
-    starts = tuple(_symbol(function) for function in functions)
-    return sorted(_reached(ROOT, starts))
-
-
 def _symbol(function: Callable[..., Any]) -> Symbol:
     while isinstance(function, partial):
         function = function.func

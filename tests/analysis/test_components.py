@@ -10,7 +10,6 @@ import xarray as xr
 from skindb.analysis import (
     face_components,
     mean_face,
-    plot_mean_face,
     principal_components,
 )
 from skindb.analysis.components import (
@@ -237,10 +236,3 @@ def test_mean_face__refuses_too_few(cohort):
         mean_face(cohort.assign(texel_coverage=0 * cohort["texel_coverage"]))
     with pytest.raises(InputError, match="condition normal"):
         mean_face(cohort.isel(take=[5]))
-
-
-def test_plot_mean_face__names_the_subjects(cohort):
-    ax = plot_mean_face(mean_face(cohort))
-    assert "n = 4" in ax.get_title()
-    assert ax.images[0].get_array().shape == (SIZE, SIZE, 3)
-    mpl.pyplot.close(ax.figure)

@@ -23,23 +23,21 @@ from planted_sheet import (
     sheet_take,
 )
 
+from benchmarks.registration import correspondence_error, mask_agreement, unregistered
 from skindb.analysis.albedo import albedo_histograms
 from skindb.analysis.regions import (
     FINE,
     inside_outline,
-    mask_agreement,
     region_masks,
     take_masks,
 )
 from skindb.analysis.registration import (
-    correspondence_error,
     corresponding_points,
     describe_registration,
     doubtful_landmarks,
     register,
     registrations,
     tabulate_registration,
-    unregistered,
 )
 from skindb.analysis.summary import cohort_of
 from skindb.errors import InputError

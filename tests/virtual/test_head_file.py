@@ -1,23 +1,9 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
 
 from skindb.errors import InputError
 from skindb.virtual.head import head_of_file, load_head
-from skindb.virtual.person import Person
-from skindb.virtual.skin import skin_of
-
-POPULATION = (
-    Path(__file__).resolve().parents[2]
-    / ".."
-    / "shared"
-    / "data"
-    / "face"
-    / "face_population.npz"
-)
-PERSON = Person("A", 40, "male", "east_asian", 3)
 
 
 def _grid(n=6):
@@ -47,7 +33,7 @@ def test_load_head__reads_a_plain_npz(tmp_path):
     np.testing.assert_array_equal(
         model.regions["forehead"], np.flatnonzero(region == 1)
     )
-    true, scan = head_of_file(tmp_path / "head.npz", PERSON)
+    true, scan = head_of_file(tmp_path / "head.npz")
     np.testing.assert_array_equal(scan.vertices, true.vertices[: len(vertices)])
     np.testing.assert_array_equal(scan.faces, faces)
     assert len(true.faces) == 4 * len(faces)
@@ -84,20 +70,3 @@ def test_load_head__refuses_what_is_no_archive(tmp_path):
         load_head(tmp_path / "head.npz")
     with pytest.raises(InputError, match="must exist"):
         load_head(tmp_path / "absent.npz")
-
-
-@pytest.mark.skipif(
-    not POPULATION.is_file(), reason="the face population beside the project is absent"
-)
-def test_head_of_file__population_gives_different_people_with_sites():
-    first, scan = head_of_file(POPULATION, PERSON)
-    second, _ = head_of_file(POPULATION, Person("B", 40, "female", "african", 4))
-    assert len(first.landmarks) == 20
-    assert np.abs(first.vertices - second.vertices).max() > 2
-    assert scan.region("nose").sum() > 50
-    assert scan.region("beard").sum() > 50
-    facing = first.landmarks["nose_tip"]
-    at = ((first.vertices - facing) ** 2).sum(axis=1).argmin()
-    assert first.normals[at, 2] > 0.7  # outwards
-    sites = skin_of(first, PERSON, material_albedo=np.full(4, 0.1), eta=1.3).sites
-    assert {site.name for site in sites} == {"cheek", "forehead", "neck"}

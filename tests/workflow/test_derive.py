@@ -20,7 +20,7 @@ from skindb.store import Database
 from skindb.workflow import cohorts, edits, fit, takes
 from skindb.workflow import derive as module
 from skindb.workflow.cohorts import summary_parameters
-from skindb.workflow.derive import Derivation, code_digest, code_symbols, derive
+from skindb.workflow.derive import Derivation, code_digest, derive
 from skindb.workflow.takes import package_digest
 
 FILES = {
@@ -175,9 +175,9 @@ def test_code_digest__refuses_functions_of_other_packages():
         code_digest(shutil.copytree)
 
 
-def test_code_symbols__of_a_fit_are_science_with_its_kernels():
-    symbols = code_symbols(second_pass)
-    modules = {name for name, _ in symbols}
+def test_code_digest__covers_a_fit_are_science_with_its_kernels():
+    reached = module._reached(module.ROOT, [module._symbol(second_pass)])
+    modules = {name for name, _ in reached}
     assert {"skindb.numerics._nnls_kernels", "skindb.jit", "skindb.threads"} <= modules
     top = {name.split(".")[1] for name in modules}
     assert top.isdisjoint({"analysis", "render", "store", "workflow", "cli", "export"})
