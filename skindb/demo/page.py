@@ -1,5 +1,5 @@
 """A self-contained HTML page with tables, which can be downloaded as CSV files, pictures of all
-subjects at one exposure and one scale, and plots in versions for light and dark pages.
+subjects at one exposure and one scale, and plots for light and dark pages.
 """
 
 from __future__ import annotations
@@ -37,7 +37,6 @@ from skindb.types import Array, Bytes, Mask
 if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
     from skindb.virtual.capture import Recovery
 
@@ -52,9 +51,7 @@ KEY_LIGHTS = ((-0.5, 0.35, 0.8), (0.55, 0.25, 0.8))
 MARGIN = 6  # pixels around a face
 SIZE = (4.4, 3.3)  # inches; text is still readable at 360 px, the width of a phone
 DOTS = 160  # per inch, twice the resolution of a page of 360 px
-# background and foreground, as in report.css
-LIGHT, DARK = ("#ffffff", "#22211f"), ("#262422", "#e9e5df")
-MAX_GREY_DIFFERENCE = 0.05  # between the channels of colours that count as grey
+INK = "#8a847c"  # of text and lines, readable on light and on dark pages
 MAX_NORMAL_ANGLE = 15  # degrees, end of the axis
 
 
@@ -93,15 +90,6 @@ def picture(image: Bytes, alt: str, *, caption: str = "") -> str:
 def row(pictures: Iterable[str], *, kind: str = "row") -> str:
     """Pictures side by side; `kind` is a class of the style sheet: "row", "wide" or "plots"."""
     return f'<div class="{kind}">{"".join(pictures)}</div>'
-
-
-def themed(light: bytes, dark: bytes, alt: str) -> str:
-    """A plot as two PNG images, of which the browser shows the one for its theme."""
-    source = f'<source media="(prefers-color-scheme: dark)" srcset="{_png(dark)}">'
-    return (
-        f'<picture>{source}<img class="plot" alt="{html.escape(alt)}" '
-        f'src="{_png(light)}"></picture>'
-    )
 
 
 def _png(data: bytes | bytearray) -> str:
@@ -289,69 +277,18 @@ def _maps(model: xr.DataTree) -> list[tuple[Picture, Mask, str]]:
     ]
 
 
-def crop_alike(
-    pictures: Sequence[Picture], masks: Sequence[Mask], margin: int = MARGIN
-) -> list[Picture]:
-    """Crop pictures to one size, so that equal widths on the page correspond to equal scale.
-
-    Parameters
-    ----------
-    pictures
-        (h, w, 3) each.
-    masks
-        (h, w) each, pixels of the face, on which the cropped picture is centred.
-    margin
-        Pixels around the largest face.
-
-    Returns
-    -------
-    list
-        (rows, cols, 3) each, black beyond the edges of the picture. Without any face,
-        pictures are not cropped.
+def crop_alike(pictures: Sequence[Picture], masks: Sequence[Mask]) -> list[Picture]:
+    """Pictures (h, w, 3) cropped to the pixels that show a face in any of the `masks`
+    (h, w), so that equal widths on the page correspond to equal scale. Without any face,
+    pictures are not cropped.
     """
-    boxes = [_box(mask) for mask in masks]
-    sizes = [
-        (bottom - top, right - start)
-        for top, bottom, start, right in filter(None, boxes)
-    ]
-    if not sizes:
+    rows, cols = np.nonzero(np.any(masks, axis=0))
+    if not rows.size:
         return list(pictures)
-    rows, cols = (int(size) + 2 * margin for size in np.max(sizes, axis=0))
-    return [
-        _window(image, box, rows, cols)
-        for image, box in zip(pictures, boxes, strict=True)
-    ]
-
-
-def _box(mask: Mask) -> tuple[int, int, int, int] | None:
-    """First row, end row, first column and end column of a face; the ends are exclusive."""
-    rows = np.flatnonzero(mask.any(axis=1))
-    cols = np.flatnonzero(mask.any(axis=0))
-    return (
-        (int(rows[0]), int(rows[-1]) + 1, int(cols[0]), int(cols[-1]) + 1)
-        if rows.size
-        else None
-    )
-
-
-def _window(
-    image: Picture, box: tuple[int, int, int, int] | None, rows: int, cols: int
-) -> Picture:
-    top, bottom, start, right = box or (0, image.shape[0], 0, image.shape[1])
-    padded = np.pad(image, ((rows, rows), (cols, cols), (0, 0)))
-    first_row = (top + bottom - rows) // 2 + rows
-    first_col = (start + right - cols) // 2 + cols
-    return np.ascontiguousarray(
-        padded[first_row : first_row + rows, first_col : first_col + cols]
-    )
-
-
-def half_size(image: Picture) -> Picture:
-    """A picture of half the size; an odd last row or column is discarded."""
-    rows = image.shape[0] // 2
-    cols = image.shape[1] // 2
-    mean = image[: 2 * rows, : 2 * cols].reshape(rows, 2, cols, 2, 3).mean(axis=(1, 3))
-    return np.asarray(np.round(mean), np.uint8)
+    top = max(rows.min() - MARGIN, 0)
+    left = max(cols.min() - MARGIN, 0)
+    end = (slice(top, rows.max() + MARGIN + 1), slice(left, cols.max() + MARGIN + 1))
+    return [image[end] for image in pictures]
 
 
 def predictions(comparisons: Sequence[Comparison], exposure: float) -> list[Picture]:
@@ -377,8 +314,8 @@ def _byte(image: Image) -> Picture:
     return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
-def themed_plot(ax: Axes, alt: str) -> str:
-    """A plot for both themes with its legend below; the figure is closed."""
+def _plot(ax: Axes, alt: str) -> str:
+    """A plot with its legend below and without a background; the figure is closed."""
     from matplotlib import pyplot
 
     handles, _ = ax.get_legend_handles_labels()
@@ -389,44 +326,25 @@ def themed_plot(ax: Axes, alt: str) -> str:
             bbox_to_anchor=(0.5, -0.18),
             ncol=2 if len(handles) < 5 else 3,
             frameon=False,
+            labelcolor=INK,
         )
+    ax.tick_params(colors=INK, which="both")
     figure = ax.get_figure(root=True)
     assert figure is not None
-    light, dark = (_figure_png(figure, *theme) for theme in (LIGHT, DARK))
-    pyplot.close(figure)
-    return themed(light, dark, alt)
-
-
-def _figure_png(figure: Figure, paper: str, ink: str) -> bytes:
-    """The figure on a background, with everything grey or black in the foreground colour."""
-    from matplotlib.colors import to_rgb
-
-    figure.set_facecolor(paper)
-    for ax in figure.axes:
-        ax.set_facecolor(paper)
-        ax.tick_params(colors=ink, which="both")
-        for spine in ax.spines.values():
-            spine.set_edgecolor(ink)
-        for text in (
-            ax.title,
-            ax.xaxis.label,
-            ax.yaxis.label,
-            *(ax.legend_.get_texts() if ax.legend_ else ()),
-        ):
-            text.set_color(ink)
-        for line in (*ax.lines, *(ax.legend_.get_lines() if ax.legend_ else ())):
-            channels = to_rgb(line.get_color())
-            if max(channels) - min(channels) < MAX_GREY_DIFFERENCE:
-                line.set_color(ink)
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DOTS, bbox_inches="tight", facecolor=paper)
-    return buffer.getvalue()
+    figure.savefig(buffer, dpi=DOTS, bbox_inches="tight", transparent=True)
+    pyplot.close(figure)
+    return (
+        f'<img class="plot" alt="{html.escape(alt)}" src="{_png(buffer.getvalue())}">'
+    )
 
 
 def _axes() -> Axes:
-    from matplotlib import pyplot
+    from matplotlib import pyplot, rc_context
 
-    ax: Axes = pyplot.figure(figsize=SIZE).add_subplot()
+    names = ("axes.edgecolor", "axes.labelcolor", "text.color")
+    with rc_context(dict.fromkeys(names, INK)):
+        ax: Axes = pyplot.figure(figsize=SIZE).add_subplot()
     return ax
 
 
@@ -455,10 +373,10 @@ def reflectance_plot(recovered: Mapping[str, Recovery]) -> str:
         # the points are too small for a legend
         ax.plot([], [], "o", ms=4, color=colour, label=name)
     top = ax.get_xlim()[1]
-    ax.plot([0, top], [0, top], "k-", lw=0.7, label="equal")
+    ax.plot([0, top], [0, top], color=INK, lw=0.7, label="equal")
     ax.set_xlabel("true diffuse reflectance R_d [1]")
     ax.set_ylabel("recovered R_d [1]")
-    return themed_plot(
+    return _plot(
         ax, "Recovered against true diffuse reflectance, with the line of equality."
     )
 
@@ -475,7 +393,7 @@ def normal_plot(recovered: Mapping[str, Recovery]) -> str:
     ax.set_xlim(0, MAX_NORMAL_ANGLE)
     ax.set_xlabel("angle between recovered and true normal [deg]")
     ax.set_ylabel("fitted surfels below [%]")
-    return themed_plot(
+    return _plot(
         ax,
         "Cumulative distribution of the angle between the recovered and the true normal, by take.",
     )
@@ -484,7 +402,7 @@ def normal_plot(recovered: Mapping[str, Recovery]) -> str:
 def translucency_plot(table: xr.Dataset) -> str:
     """Plot of mean sigma_tr by site and channel."""
     alt = "Mean sigma_tr with its 95 % interval, by site and channel."
-    return themed_plot(plot_translucency(table, ax=_axes()), alt)
+    return _plot(plot_translucency(table, ax=_axes()), alt)
 
 
 def basis_size_plot(curve: xr.Dataset) -> str:
@@ -493,10 +411,10 @@ def basis_size_plot(curve: xr.Dataset) -> str:
         "Relative error of the reflectance against the number of basis BRDFs, with its "
         "95 % interval."
     )
-    return themed_plot(plot_basis_size(curve, ax=_axes()), alt)
+    return _plot(plot_basis_size(curve, ax=_axes()), alt)
 
 
 def albedo_plot(histograms: xr.Dataset) -> str:
     """Plot of histograms of the first decorrelated axis of the albedo."""
     alt = "Histograms of the albedo along its first decorrelated axis, one line for each take."
-    return themed_plot(plot_albedo(histograms, ax=_axes()), alt)
+    return _plot(plot_albedo(histograms, ax=_axes()), alt)

@@ -23,7 +23,6 @@ from skindb.demo.page import (
     Portraits,
     Table,
     draw_portraits,
-    half_size,
     map_pictures,
     portrait,
     predictions,
@@ -363,7 +362,7 @@ def subjects_section(results: Results, portraits: Portraits) -> list[str]:
             _subject(
                 record,
                 results,
-                page.picture(half_size(drawn[take]), _alt(take, record)),
+                page.picture(drawn[take][::2, ::2], _alt(take, record)),
                 blocks,
             )
         )

@@ -58,12 +58,3 @@ def test_cell__is_short_and_readable():
         "a",
         "True",
     ]
-
-
-def test_themed__names_a_picture_for_dark_pages():
-    text = page.themed(b"light", b"dark", "a plot")
-    dark, light = (
-        base64.b64decode(one) for one in re.findall(r"base64,([^\"]+)", text)
-    )
-    assert (dark, light) == (b"dark", b"light")
-    assert text.index("prefers-color-scheme: dark") < text.index("<img")
