@@ -366,7 +366,8 @@ def radial_profile(
     """R(r) in mm^-2 per photon that enters, as mean over rings between `edges` (k + 1,)
     mm, and its standard error.
     """
-    escaped = _escaped_weight(escapes, sigma_a / sigma_s_prime)
+    ratio = sigma_a / sigma_s_prime
+    escaped = np.asarray(escapes.weight * np.exp(-ratio * escapes.path.astype(float)))
     ring = np.searchsorted(edges, escapes.radius / sigma_s_prime, side="right") - 1
     count = len(edges) - 1
     inside = (ring >= 0) & (ring < count)
@@ -375,8 +376,3 @@ def radial_profile(
     area = np.pi * np.diff(edges**2)
     density = energy.reshape(BATCHES, count) * (BATCHES / escapes.packets) / area
     return density.mean(axis=0), density.std(axis=0, ddof=1) / np.sqrt(BATCHES)
-
-
-def _escaped_weight(escapes: Walk, ratio: float) -> Array:
-    """Weights of the escapes with the absorption sigma_a / sigma_s'."""
-    return np.asarray(escapes.weight * np.exp(-ratio * escapes.path.astype(float)))
