@@ -22,7 +22,7 @@ from skindb.analysis.study import (
 )
 from skindb.analysis.subjects import takes_to_compare
 from skindb.errors import input_error, require
-from skindb.numerics.statistics import benjamini_hochberg, known_mean
+from skindb.numerics.statistics import known_mean
 from skindb.parameters import permutations_option, seed_option
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit, require_takes
@@ -127,7 +127,7 @@ def component_correlations(
             variables.COMPONENT_CORRELATION_LOW: low,
             variables.COMPONENT_CORRELATION_HIGH: high,
             variables.CORRELATION_P: p,
-            variables.CORRELATION_P_FALSE_DISCOVERY: benjamini_hochberg(p),
+            variables.CORRELATION_P_FALSE_DISCOVERY: stats.false_discovery_control(p),
             variables.CORRELATION_COUNT: count,
         },
         coords={"pair": [f"{COMPONENTS[i]} with {COMPONENTS[j]}" for i, j in pairs]},

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
+from scipy import stats
 from scipy.special import gammaln
 
 from skindb import plots
@@ -36,7 +37,6 @@ from skindb.numerics.inference import (
     Effects,
 )
 from skindb.numerics.statistics import (
-    benjamini_hochberg,
     detectable_difference,
     known_mean,
 )
@@ -170,7 +170,7 @@ def _statistics(comparison: Comparison[ContrastTest]) -> dict[str, Array]:
     p = test.p
     percent, low, high = _percent(fit, _reference(contrast, fit), contrast.quantities)
     discovered = np.full(len(p), np.nan)
-    discovered[np.isfinite(p)] = benjamini_hochberg(p[np.isfinite(p)])
+    discovered[np.isfinite(p)] = stats.false_discovery_control(p[np.isfinite(p)])
     standardised = np.divide(
         fit.slope, fit.spread, out=np.full_like(fit.slope, np.nan), where=fit.spread > 0
     )

@@ -132,16 +132,6 @@ def known_mean(values: Array) -> Array:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def benjamini_hochberg(p: Array) -> Array:
-    """P values adjusted to control the false discovery rate (Benjamini and Hochberg 1995)."""
-    p = float64(p)
-    order = np.argsort(p)
-    raised = p[order] * len(p) / np.arange(1, len(p) + 1)
-    adjusted = np.empty_like(p)
-    adjusted[order] = np.minimum(np.minimum.accumulate(raised[::-1])[::-1], 1.0)
-    return adjusted
-
-
 def detectable_difference(error: Array, free: Array | float) -> Array:
     """Smallest effect that a test at the level of 5 % detects with a power of 80 %, from
     the standard error of its estimate and its degrees of freedom.

@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 from skindb.errors import Fault, InputError, input_error
 from skindb.schema.consent import CONSENT, consent_scope
@@ -72,33 +72,6 @@ CACHED_FIELDS = (
     "seal",
 )
 Key = tuple[str, str, int]
-
-
-class Records(Protocol):
-    """A source of takes and records."""
-
-    def takes(self, kind: str) -> list[str]:
-        """Takes with a version of this kind."""
-
-    def has(self, kind: str, take: str) -> bool:
-        """Whether a take has a version of this kind."""
-
-    def record(self, kind: str, take: str, generation: int | None = None) -> Record:
-        """The record of a version, by default the current one."""
-
-
-class CachedRecords(Records, Protocol):
-    """A source that keeps the records that it has read."""
-
-    snapshot: Snapshot  # with the withdrawals when the source was made
-
-    def read_ahead(
-        self, kinds: Iterable[str], pins: Mapping[tuple[str, str], int]
-    ) -> None:
-        """Read the newest records of these kinds, and these generations, in parallel."""
-
-    def save(self) -> None:
-        """Write the cache."""
 
 
 class Snapshot:
@@ -214,7 +187,7 @@ class Lookup:
         self,
         db: Located,
         release: str | None = None,
-        cache: CachedRecords | None = None,
+        cache: RecordCache | None = None,
     ) -> None:
         self.place = db.place
         self._cache = cache
@@ -534,6 +507,9 @@ class RecordCache:
             )
             self._changed = True
         return record
+
+
+Records = Snapshot | RecordCache  # a source of takes and records
 
 
 def cache_names(place: Place, is_named: Callable[[str], bool]) -> bool:

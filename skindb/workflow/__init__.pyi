@@ -38,7 +38,6 @@ from .pictures import (
     landmark_page,
     render_take,
     show_take,
-    translucency_grid,
     view_server,
     view_takes,
 )
@@ -113,7 +112,6 @@ __all__ = [
     "superseded_lines",
     "takes_to_fit",
     "takes_without_consent",
-    "translucency_grid",
     "view_server",
     "view_takes",
     "withdraw",

@@ -39,7 +39,6 @@ BEGINNINGS = ("ingest", "calibrate", "restore")  # actions that may create a dat
 RECORDED = (
     "edited",
     "explain",
-    "faces",
     "generation",
     "generations",
     "gltf",

@@ -13,7 +13,6 @@ from scipy import stats
 from skindb.numerics.inference import effects
 from skindb.numerics.statistics import (
     Moments,
-    benjamini_hochberg,
     bootstrap_interval,
     detectable_difference,
     variance_components,
@@ -69,13 +68,6 @@ def test_bootstrap_interval__of_a_mean():
     np.testing.assert_allclose([low, high], want, atol=0.02)
     with pytest.raises(ValueError, match="at least one row"):
         bootstrap_interval(x[:0], np.mean, rng=np.random.default_rng(0))
-
-
-def test_benjamini_hochberg__is_that_of_scipy():
-    p = np.random.default_rng(3).random(50) ** 3
-    np.testing.assert_allclose(
-        benjamini_hochberg(p), stats.false_discovery_control(p), rtol=1e-12
-    )
 
 
 def test_detectable_difference__is_found_as_often_as_stated():
