@@ -1,7 +1,5 @@
 """Cache on disk for tables that take seconds to compute and do not depend on measured data."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

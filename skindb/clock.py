@@ -1,7 +1,5 @@
 """Time as a parameter: the clock of this computer, and a simulated one for emulated devices."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Protocol

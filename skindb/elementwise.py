@@ -1,7 +1,5 @@
 """Application of a numeric kernel to surfels (or profiles), lazily and block by block."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

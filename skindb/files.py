@@ -2,8 +2,6 @@
 comma-separated values, and converts values to JSON.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -5,8 +5,6 @@ Each limit is about ten times the largest value that known domes and scanners wr
 docs/capture_format.md lists them.
 """
 
-from __future__ import annotations
-
 MB = 1_000_000  # bytes
 
 MAX_JSON_BYTES = 32 * MB  # regions list a few million vertices

@@ -1,7 +1,5 @@
 """Linear algebra on one thread, so that results do not depend on the number of cores."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar

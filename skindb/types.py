@@ -1,7 +1,5 @@
 """Types shared by many modules."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

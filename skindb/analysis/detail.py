@@ -2,8 +2,6 @@
 (Weyrich et al. 2005, section 11).
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Edits of a model along trait vectors (Weyrich et al. 2005, section 11)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -5,8 +5,6 @@ Weyrich et al. 2005, section 10.2, defines a beard and a no-beard region; the fi
 regions are an addition.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import cache
 

@@ -1,7 +1,5 @@
 """The studies of a population, and what is shown of a stored one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import xarray as xr

@@ -2,8 +2,6 @@
 sample of surfels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Literal
 

@@ -4,8 +4,6 @@ of the takes.
 Weyrich et al. 2005, section 10.1 and figures 7, 14 and 15.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations

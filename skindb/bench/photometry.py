@@ -2,8 +2,6 @@
 merged from exposures.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from typing import Any

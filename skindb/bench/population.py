@@ -1,7 +1,5 @@
 """Curves of methods of population studies."""
 
-from __future__ import annotations
-
 from functools import partial
 from importlib.util import find_spec
 

@@ -2,8 +2,6 @@
 mpmath and Monte Carlo, and the octree against the sum over every pair.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache, partial
 from typing import Any

@@ -2,8 +2,6 @@
 SciPy's solver, factorisations with scikit-learn, and tables averaged over a disc light.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -2,8 +2,6 @@
 dark level, with their errors; the colour matrix follows from a photographed colour chart.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Fibres of the contact probe: their signals, and the calibration of their centres and gains."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from functools import partial

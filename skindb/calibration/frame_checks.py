@@ -2,8 +2,6 @@
 their camera, wrong levels, blank pictures.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise

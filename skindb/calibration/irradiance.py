@@ -2,8 +2,6 @@
 white target (Weyrich et al. 2005, section 5).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass

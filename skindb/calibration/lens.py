@@ -2,8 +2,6 @@
 from frames of an evenly bright surface.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Commands that draw, show or export models: render, compare, show, export, view."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path

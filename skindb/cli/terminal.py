@@ -2,8 +2,6 @@
 escaped, and progress on standard error: bars for people, lines of JSON for programs.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import time

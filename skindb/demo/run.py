@@ -1,7 +1,5 @@
 """Run all stages of the library on virtual subjects, and write a report."""
 
-from __future__ import annotations
-
 import shutil
 from functools import partial
 from pathlib import Path

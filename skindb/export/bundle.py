@@ -2,8 +2,6 @@
 README.txt.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

@@ -2,8 +2,6 @@
 of the approximation.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path

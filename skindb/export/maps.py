@@ -1,7 +1,5 @@
 """Texture maps of a fitted model in its texture atlas, and tangent frames as in glTF 2.0."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -2,8 +2,6 @@
 Mitsuba 3 with a program that evaluates the exact BRDFs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path

@@ -5,8 +5,6 @@ Limits are about ten times beyond any device known to us: they find wrong units 
 slips, not unusual devices.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product

@@ -2,8 +2,6 @@
 records, with all faults at once.
 """
 
-from __future__ import annotations
-
 import difflib
 import json
 import os

@@ -2,8 +2,6 @@
 after every load; templates of their paths, which must stay inside the folder.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import io

@@ -3,8 +3,6 @@ the likely units of parts that are not, exchanged left and right; the file besid
 landmarks that holds the box by which the scan is cropped.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property

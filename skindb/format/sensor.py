@@ -1,7 +1,5 @@
 """Sensors of cameras and probes: levels, noise and response."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

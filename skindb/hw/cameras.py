@@ -1,7 +1,5 @@
 """Cameras that write files, and the assignment of their frames to triggers."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Capture of a subject with dome and probe into the folder that `skindb ingest` reads."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import product

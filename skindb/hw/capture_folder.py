@@ -2,8 +2,6 @@
 version 2), with its lock, and with the file `unfinished.json` until it is complete.
 """
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import json

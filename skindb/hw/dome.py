@@ -2,8 +2,6 @@
 the measurements.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -2,8 +2,6 @@
 before they are used, requests with deadlines, and a log of all bytes.
 """
 
-from __future__ import annotations
-
 import ast
 import binascii
 import math

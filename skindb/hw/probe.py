@@ -1,7 +1,5 @@
 """The fibre probe: suction with a gauge, a light source, and a trigger for its camera."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 

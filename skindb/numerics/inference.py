@@ -10,8 +10,6 @@ the squared distance of their means divided by the sum of their mean squared sca
 each over its number of subjects; in one dimension it is the square of Welch's t.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, islice, permutations, product

@@ -1,7 +1,5 @@
 """Non-negative least squares with a certificate, in batches (Weyrich et al. 2005, eq. 8)."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

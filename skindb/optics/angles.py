@@ -1,7 +1,5 @@
 """Half and difference angles of a pair of directions (Rusinkiewicz 1998)."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -6,8 +6,6 @@ The reflectance uses s = sqrt(3 (1 - alpha')), which is also the stored variable
 near 1 suffers from cancellation.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -2,8 +2,6 @@
 Weyrich et al. 2005, eq. 9).
 """
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Fresnel reflection at the smooth boundary of air and skin (Weyrich et al. 2005, eq. 1 and 2)."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

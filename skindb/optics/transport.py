@@ -30,8 +30,6 @@ transport equation for the semi-infinite medium", with a different contour). Thi
 integrand does not oscillate, so the far tail is accurate.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

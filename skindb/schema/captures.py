@@ -1,7 +1,5 @@
 """Variables of a version of kind "capture": samples, surface, dome, probe, photographs."""
 
-from __future__ import annotations
-
 from skindb.schema.declaration import PAPER, Use, declare
 
 # samples

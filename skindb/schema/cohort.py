@@ -1,7 +1,5 @@
 """Combining Datasets of many takes into one labelled, lazy Dataset."""
 
-from __future__ import annotations
-
 import re
 import unicodedata
 import uuid

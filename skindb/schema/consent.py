@@ -1,7 +1,5 @@
 """Checks of the consent of subjects, for every step that needs a scope of consent."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

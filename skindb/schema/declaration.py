@@ -2,8 +2,6 @@
 members have an explanation.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from enum import Flag, IntEnum, auto

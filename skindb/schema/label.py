@@ -2,8 +2,6 @@
 checked where they are passed between packages; all faults are reported together.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any
 

@@ -2,8 +2,6 @@
 translucency, and data for cohorts.
 """
 
-from __future__ import annotations
-
 from skindb.schema.declaration import PAPER, FitStatus, ProbeStatus, Use, declare
 
 MISFIT = "median absolute residual in units of the noise scale of each surfel"

@@ -3,8 +3,6 @@ skips, with the bound on the error this costs (MODEL.md, section 11). They becom
 where they are printed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any

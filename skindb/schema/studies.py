@@ -1,7 +1,5 @@
 """Variables of registrations, of studies of a population, and of reports on dictionaries."""
 
-from __future__ import annotations
-
 from skindb.schema.declaration import PAPER, TexelStatus, declare
 
 TABLE_2 = f"{PAPER}, table 2"

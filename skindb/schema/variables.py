@@ -3,8 +3,6 @@
 Code refers to a stored variable as ``variables.DIFFUSE_REFLECTANCE``.
 """
 
-from __future__ import annotations
-
 from skindb.schema.captures import *  # noqa: F403
 from skindb.schema.declaration import DECLARED, Variable
 from skindb.schema.models import *  # noqa: F403

@@ -9,8 +9,6 @@ withdrawals that were applied.
 | `leases/`, `staging/` | as in a database |
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

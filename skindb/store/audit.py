@@ -8,8 +8,6 @@ starts again with the next number. Blocks have a limited size, so that the last 
 is found by listing one of them.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import uuid

@@ -8,8 +8,6 @@ withdrawn meanwhile. If a version was removed meanwhile, the next attempt lists 
 database again.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, replace

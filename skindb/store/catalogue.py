@@ -1,7 +1,5 @@
 """The catalogue with one row per take, and queries on it."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterable
 from typing import Any

@@ -6,8 +6,6 @@ of columns with literals or other columns, which may be chained, ``and``, ``or``
 neither true nor false.
 """
 
-from __future__ import annotations
-
 import ast
 import difflib
 import operator

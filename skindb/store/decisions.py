@@ -1,7 +1,5 @@
 """Consents and releases: versions that record a decision and hold no data."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 

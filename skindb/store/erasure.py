@@ -4,8 +4,6 @@ Erasure computes nothing and needs no free space. `withdrawn/` alone determines 
 removed, so that any run can complete an erasure that was interrupted.
 """
 
-from __future__ import annotations
-
 import errno
 import re
 from collections import Counter

@@ -1,7 +1,5 @@
 """A local folder as the location of a database."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import os

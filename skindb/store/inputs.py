@@ -4,8 +4,6 @@ covered by consent.
 A subject may be withdrawn, or change the consent, while the version is computed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import Any

@@ -10,8 +10,6 @@ ages are measured by the clock of the storage, because the clocks of the machine
 differ. Leases only prevent wasted work: the log alone decides what is committed.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -8,8 +8,6 @@ seal under an opaque name. A head names the newest record. It is a cache that ma
 missing or outdated, but if it is intact and ahead of the log, a record was lost.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

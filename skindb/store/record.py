@@ -2,8 +2,6 @@
 all validated before they are used.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

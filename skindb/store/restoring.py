@@ -5,8 +5,6 @@ A restore writes into an empty place only. Until it is complete,
 it. Nothing of a withdrawn subject is copied.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Stages: versions that are being written, which are invisible until their record is in the log."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import uuid

@@ -2,8 +2,6 @@
 faults are reported together.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor

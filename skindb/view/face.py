@@ -2,8 +2,6 @@
 and distant lights in place of an environment, compressed as text.
 """
 
-from __future__ import annotations
-
 import base64
 import zlib
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The page in which landmarks are set on a scan, and its files."""
 
-from __future__ import annotations
-
 import hashlib
 import html
 import json

@@ -2,8 +2,6 @@
 the comparison of fitted with true parameters.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -3,8 +3,6 @@ its frames, with exposure behind the lens, noise, saturation, quantisation and b
 and the white target.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace

@@ -2,8 +2,6 @@
 simple solids; and its landmarks and regions.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -2,8 +2,6 @@
 parametric or from the file of a head model.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass

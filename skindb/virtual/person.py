@@ -1,7 +1,5 @@
 """Virtual subjects: a frozen record that determines shape, skin and condition."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache

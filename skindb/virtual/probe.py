@@ -2,8 +2,6 @@
 images of 28 fibres.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ Colours: International Skin Spectra Archive (Lu et al. 2025), reflectance spectr
 converted to scene-linear Rec. 709 under D65, means over people by group and site.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 

@@ -2,8 +2,6 @@
 what they return.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import lazy_loader

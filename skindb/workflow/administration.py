@@ -5,8 +5,6 @@ A withdrawal erases the data of a subject before anything is computed again, and
 imports no code that computes.
 """
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence

@@ -2,8 +2,6 @@
 dated, versioned, and named by the captures that used them.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterable
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Models moved along traits: committed, or drawn as a grid of pictures."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """From the capture of a take to a version of its model."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Pictures, exports and pages of the models of a database."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A capture session in a real or virtual laboratory."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import time

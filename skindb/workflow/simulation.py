@@ -1,7 +1,5 @@
 """Virtual captures, several at a time."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Sequence

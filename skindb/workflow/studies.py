@@ -2,8 +2,6 @@
 committed with the cohorts, registrations and tables of BRDFs that they were made from.
 """
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 import json
