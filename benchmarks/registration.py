@@ -4,11 +4,11 @@ points, and regions.
     python -m benchmarks registration CAPTURE ... [--shared N] [--stride N] [--brief]
 
 Only the scan, landmarks and regions of the folder CAPTURE are read, not its frames. The
-vertices of the truth must be the same points of every head, as in captures of
-`skindb simulate --head FILE`, or the first N of them. Prints Markdown
-tables: errors in mm by region without and with the warp, for the unchanged scans and
-for scans that end at different places; errors in mm by number of landmarks, errors of
-clicks and smoothing; agreement of regions from landmarks with those of the captures.
+vertices of the truth must be the same points of every head, or the first N of them.
+Prints Markdown tables: errors in mm by region without and with the warp, for the
+unchanged scans and for scans that end at different places; errors in mm by number of
+landmarks, errors of clicks and smoothing; agreement of regions from landmarks with those
+of the captures.
 Use other heads than those on which thresholds were chosen.
 """
 

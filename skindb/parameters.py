@@ -407,8 +407,6 @@ class SimulationParameters(Limited):
     ----------
     cameras, lights, width, height
         The dome and its frames in pixels.
-    head
-        Head model file that replaces the parametric face.
     subsurface
         Transport diffuse light through the skin by the dipole instead of reflecting it
         where it enters.
@@ -430,9 +428,6 @@ class SimulationParameters(Limited):
     )
     height: int = option(
         200, "Height of a frame in pixels.", minimum=16, maximum=MAX_FRAME_SIDE_PX
-    )
-    head: Path | None = option(
-        None, "File of a head model to use instead of the parametric face."
     )
     subsurface: bool = option(False, "Simulate subsurface transport by the dipole.")
     polarised: bool = option(

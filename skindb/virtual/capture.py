@@ -52,7 +52,7 @@ from skindb.virtual.dome import (
     frontal_camera,
     photograph,
 )
-from skindb.virtual.head import Head, head_of_file, parametric_head
+from skindb.virtual.head import Head, parametric_head
 from skindb.virtual.person import Person, default_people, face_shape
 from skindb.virtual.probe import ProbeTruth, write_probe
 from skindb.virtual.skin import MATERIALS, Skin, skin_of, smooth_noise
@@ -314,8 +314,6 @@ def _heads(
     person: Person, spacing_mm: float, rng: np.random.Generator
 ) -> tuple[Head, Head]:
     """The true head, and a coarser sampling of it for the scan."""
-    if person.head_file is not None:
-        return head_of_file(person.head_file)
     shape = face_shape(person)
     coarse = max(SCAN_SPACING, 1.8 * spacing_mm)
     scan = parametric_head(
@@ -455,7 +453,7 @@ def simulate_takes(
     folders = []
     everybody = default_people() if people is None else people
     for i in range(len(everybody))[:takes] if isinstance(takes, int) else takes:
-        person = replace(everybody[i], head_file=settings.head)
+        person = everybody[i]
         folders.append(out / person.take)
         simulate_take(
             folders[-1],

@@ -1,26 +1,14 @@
-"""Heads: the skin's surface as an open disc of triangles, with landmarks and regions,
-parametric or from the file of a head model.
-"""
+"""Heads: the skin's surface as an open disc of triangles, with landmarks and regions."""
 
-import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
-from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
-import trimesh
-from numpy.typing import NDArray
-from scipy import sparse
 from scipy.interpolate import RectBivariateSpline
 
-from skindb.errors import Fault, InputError, input_error, require
-from skindb.geometry.mesh import subdivide, vertex_normals
 from skindb.types import Float64, Index, Mask
 from skindb.virtual.face import (
-    REGIONS,
     STEP,
     FaceShape,
     field,
@@ -36,15 +24,6 @@ LEAST_SLOPE = 0.1
 SETTLED_MM = 0.01
 SETTLE_ROUNDS = 20
 RELAX = 8  # rounds that even out the triangles under nose and chin
-# names of regions in other models -> names in skindb
-SAME_REGION = {
-    "brow": "forehead",
-    "upper_lip": "beard",
-    "jaw": "beard",
-    "neck_beard": "beard",
-}
-# rounds of averaging over neighbours to convert labels to smooth memberships
-SOFTEN = 6
 
 
 @dataclass(frozen=True)
@@ -218,151 +197,3 @@ def _grid_faces(rows: int, columns: int) -> Index:
     lower = np.where(even, np.stack([a, d, c], -1), np.stack([a, d, b], -1))
     second = np.where(even, np.stack([a, c, b], -1), np.stack([d, c, b], -1))
     return np.stack([lower, second], axis=2).reshape(-1, 3).astype(int)
-
-
-@dataclass(frozen=True)
-class HeadModel:
-    """Contents of a head model file."""
-
-    vertices: Float64  # (n, 3) mm
-    faces: Index  # (m, 3)
-    landmarks: Mapping[str, int] = dataclasses.field(
-        default_factory=dict
-    )  # name -> vertex
-    # name -> vertices
-    regions: Mapping[str, Index] = dataclasses.field(default_factory=dict)
-
-
-def load_head(path: Path) -> HeadModel:
-    """Read a head model.
-
-    Parameters
-    ----------
-    path
-        .npz with `vertices` and `faces` (optionally `landmark_names`,
-        `landmark_vertex`, `region`, `region_names`), or a mesh file (.ply, .obj).
-
-    Returns
-    -------
-    HeadModel
-        Raises `InputError` for a file that is none of these.
-    """
-    require(path.is_file(), str(path), "head model file must exist", "no file")
-    if path.suffix.lower() != ".npz":
-        mesh = trimesh.load(path, process=False, maintain_order=True, force="mesh")
-        return _checked(
-            path,
-            HeadModel(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, int)),
-        )
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (BadZipFile, ValueError, OSError) as error:
-        raise input_error(
-            str(path), "head model must be a readable npz archive", str(error)
-        ) from error
-    if not {"vertices", "faces"} <= arrays.keys():
-        names = ", ".join(sorted(arrays)) or "nothing"
-        raise input_error(
-            str(path),
-            "head model needs the arrays vertices and faces",
-            names,
-        )
-    return _checked(path, _plain(arrays))
-
-
-def _checked(path: Path, model: HeadModel) -> HeadModel:
-    faults = []
-    if (
-        model.vertices.ndim != 2
-        or model.vertices.shape[1:] != (3,)
-        or not np.isfinite(model.vertices).all()
-    ):
-        faults.append(
-            Fault(
-                str(path),
-                "vertices must be finite points (n, 3) in mm",
-                str(model.vertices.shape),
-            )
-        )
-    if (
-        not len(model.faces)
-        or model.faces.min() < 0
-        or model.faces.max() >= len(model.vertices)
-    ):
-        faults.append(
-            Fault(
-                str(path),
-                "faces must be triangles of existing vertices",
-                f"{len(model.faces)} faces",
-            )
-        )
-    if faults:
-        raise InputError(faults)
-    return model
-
-
-def _plain(a: Mapping[str, NDArray[Any]]) -> HeadModel:
-    names = a.get("landmark_names", np.array([]))
-    vertex = a.get("landmark_vertex", np.array([]))
-    landmarks = {str(n): int(v) for n, v in zip(names, vertex, strict=True)}
-    return HeadModel(
-        a["vertices"].astype(float), a["faces"].astype(int), landmarks, _regions(a)
-    )
-
-
-def _regions(a: Mapping[str, NDArray[Any]]) -> dict[str, Index]:
-    if "region" not in a:
-        return {}
-    out = {
-        str(name): np.flatnonzero(a["region"] == i)
-        for i, name in enumerate(a["region_names"])
-    }
-    if "beard" in a:
-        out["beard"] = np.flatnonzero(a["beard"])
-    return out
-
-
-def head_of_file(path: Path) -> tuple[Head, Head]:
-    """The true head of a model file (one Loop subdivision), and the scan in the topology
-    of the file.
-    """
-    model = load_head(path)
-    vertices, faces, matrix = subdivide(model.vertices, model.faces, 1)
-    count = len(model.vertices)
-    soft = _membership(model)
-    normals = vertex_normals(vertices, faces)
-    true = Head(
-        vertices,
-        faces,
-        normals,
-        {name: vertices[v] for name, v in model.landmarks.items()},
-        {name: np.asarray(matrix @ values) for name, values in soft.items()},
-    )
-    # Loop subdivision keeps the old vertices first: the scan has the file's triangles
-    # on the true surface
-    return true, Head(
-        vertices[:count], model.faces, normals[:count], true.landmarks, soft
-    )
-
-
-def _membership(model: HeadModel) -> dict[str, Float64]:
-    """Smooth memberships of the regions that skindb uses, from the labels of the file."""
-    n = len(model.vertices)
-    edge = np.concatenate(
-        [model.faces[:, [0, 1]], model.faces[:, [1, 2]], model.faces[:, [2, 0]]]
-    )
-    near = sparse.coo_matrix(
-        (np.ones(len(edge)), (edge[:, 0], edge[:, 1])), (n, n)
-    ).tocsr()
-    near = near + near.T + sparse.identity(n)
-    near.data[:] = 1
-    mean = sparse.diags(1 / np.asarray(near.sum(axis=1)).ravel()) @ near
-    fields = np.zeros((n, len(REGIONS)))
-    for name, ids in model.regions.items():
-        ours = SAME_REGION.get(name, name)
-        if ours in REGIONS:
-            fields[ids, REGIONS.index(ours)] = 1
-    for _ in range(SOFTEN):
-        fields = mean @ fields
-    return {name: fields[:, i] for i, name in enumerate(REGIONS)}

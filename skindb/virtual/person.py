@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -42,7 +41,6 @@ class Person:
     melanin: float = 0.0  # standard deviations from the mean of the group
     blood: float = 0.0  # standard deviations
     fullness: float = 0.5  # of the cheeks, 0 to 1
-    head_file: Path | None = None  # a head model file instead of the parametric face
 
     def __post_init__(self) -> None:
         for value, allowed, name in (

@@ -50,7 +50,7 @@ def simulate(
         Called with the stage, the number of finished steps and the total number; only
         in this process.
     **options
-        Of `skindb.parameters.SimulationParameters`: cameras, lights, width, height, head,
+        Of `skindb.parameters.SimulationParameters`: cameras, lights, width, height,
         subsurface, polarised, seed.
 
     Returns
@@ -93,8 +93,6 @@ def begin_cohort(
     """
     # which takes have which noise depends on the conditions
     options = asdict(parameters) | {"conditions": list(conditions)}
-    if parameters.head is not None:
-        options["head"] = str(parameters.head)
     note = out / COHORT
     if note.is_file():
         stored = _stored_options(note)
