@@ -99,7 +99,7 @@ def _above(values, exact, wi, wo, lowest):
 def _summary(report) -> None:
     print("| figure | median | worst | material |\n|---|---|---|---|")
     for name, values in report.items():
-        worst = report["basis"].values[int(np.argmax(values.fillna(-1).values))]
+        worst = report["dictionary"].values[int(np.argmax(values.fillna(-1).values))]
         print(
             f"| {name} | {float(values.median()):.3g} | {float(values.max()):.3g} | {worst} |"
         )
