@@ -10,8 +10,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.reflectance.kinds import surface_model
+from skindb.reflectance.kinds import even_diffuse, surface_model
 from skindb.reflectance.model import Lamp, Points, ReflectanceModel
+from skindb.render.surfels import reflectance_errors
 from skindb.schema import variables
 from skindb.types import Array
 
@@ -19,6 +20,8 @@ from skindb.types import Array
 NEAR_MIRROR = np.radians(1.5)
 # from the normal to both directions [rad], where fitted and true peaks are compared
 PEAK_ANGLE = np.radians(25.0)
+MIN_COSINE = 0.15  # to light and camera, above which stated errors are compared
+NORMAL_95 = 1.96
 DISTANCE = 1000.0  # mm, of the light from the point whose peak is evaluated
 
 
@@ -82,6 +85,60 @@ def near_mirror(
             error += float(((predicted - sample) ** 2).sum())
             signal += float((sample**2).sum())
     return NearMirror(count, error, signal)
+
+
+class Stated(NamedTuple):
+    """Counts of held-out values, and of those within 1.96 times `evaluate_error`."""
+
+    measured: int  # with half vectors at least as far from the normal as a fitted one
+    measured_inside: int
+    extrapolated: int
+    extrapolated_inside: int
+
+
+def stated_errors(
+    samples: xr.Dataset, model: xr.DataTree, used: NDArray[np.bool]
+) -> Stated:
+    """Held-out samples of the surfels `used` (n,) within their stated intervals, above
+    cosines of MIN_COSINE.
+    """
+    held = np.flatnonzero(model["held_out"]["light_held_out"].values)
+    fitted = model["fitted"].to_dataset().isel(surfel=used)
+    part = samples.isel(light=held, surfel=used)
+    observed = part[variables.REFLECTANCE_SAMPLE].values
+    position = part[variables.SURFEL_POSITION].values.astype(np.float64)
+    surface = surface_model(model["basis"].to_dataset())
+    eta = float(fitted[variables.REFRACTIVE_INDEX])
+    normal = fitted[variables.SHADING_NORMAL].values.astype(np.float64)
+    seen = np.radians(fitted[variables.SMALLEST_HALF_ANGLE].values)
+    counts = np.zeros((2, 2), np.int64)
+    for j, camera in enumerate(part["camera_position"].values):
+        to_camera = _away(position, camera)
+        for i, light in enumerate(part["light_position"].values):
+            to_light = _away(position, light)
+            cosine = (normal * to_light).sum(axis=1)
+            lowest = np.minimum(cosine, (normal * to_camera).sum(axis=1))
+            known = np.isfinite(observed[:, i, j]).all(axis=1) & (lowest > MIN_COSINE)
+            rows = fitted.isel(surfel=known)
+            points = Points(
+                position[known],
+                normal[known],
+                to_camera[known],
+                even_diffuse(rows),
+                surface.parameters_of(rows),
+            )
+            sample = observed[known, i, j].astype(np.float64)
+            wrong = predict(surface, points, light, eta=eta) - sample
+            stated = reflectance_errors(
+                rows, surface, to_light[known], to_camera[known]
+            )
+            inside = np.abs(wrong) < NORMAL_95 * stated * cosine[known, None]
+            half = to_light + to_camera
+            half /= np.linalg.norm(half, axis=1, keepdims=True)
+            nearer = ((half * normal).sum(axis=1) > np.cos(seen))[known]
+            for row, chosen in enumerate((~nearer, nearer)):
+                counts[row] += inside[chosen].size, inside[chosen].sum()
+    return Stated(*counts.ravel().tolist())
 
 
 def predict(

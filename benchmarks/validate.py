@@ -15,7 +15,9 @@ and memory. The columns from "near mirror" on are of fitted surfels:
   times the true one;
 - in the 95 % interval of R_d, half-width: of each channel;
 - z of regions: mean and standard deviation of the errors of mean R_d of the true regions
-  over the stated total errors.
+  over the stated total errors;
+- held-out samples: within 1.96 times `evaluate_error`, with half vectors farther from the
+  normal than some fitted sample, and nearer.
 """
 
 from __future__ import annotations
@@ -31,10 +33,13 @@ import xarray as xr
 
 import skindb
 from benchmarks.highlights import (
+    NORMAL_95,
     PEAK_ANGLE,
     NearMirror,
+    Stated,
     fitted_peaks,
     near_mirror,
+    stated_errors,
 )
 from benchmarks.stages import Stages, stage_lines
 from benchmarks.truth import Truth, mirror_bases, read_truth, regions
@@ -64,8 +69,8 @@ COLUMNS = (
     "in the 95 % interval of R_d, R G B [%]",
     "half-width R G B [%]",
     "z of regions",
+    "held-out samples in the 95 % interval, measured, extrapolated directions [%]",
 )
-NORMAL_95 = 1.96
 FALSE_PEAK = 3.0  # times the true peak
 MIN_REGION = 50  # surfels of a region whose mean is compared
 STAGES = (
@@ -128,7 +133,12 @@ def highlights(
         highest = FALSE_PEAK * weight @ mirror_bases(truth, PEAK_ANGLE)
         false = float((peaks > highest)[used].mean())
     near = near_mirror(samples, model, normal, used)
-    return {"near_mirror": near._asdict(), "false_highlights": false}
+    stated = stated_errors(samples, model, used)
+    return {
+        "near_mirror": near._asdict(),
+        "false_highlights": false,
+        "stated": stated._asdict(),
+    }
 
 
 def intervals(model: xr.DataTree, truth: Truth, recovery: Recovery) -> dict[str, Any]:
@@ -183,6 +193,7 @@ def error_row(r: dict[str, Any]) -> str:
         f"{100 * near.relative:.0f}, {near.samples:,}",
         f"{100 * r['false_highlights']:.1f}",
         *_interval_cells(r["coverage"], r["half_width"], r["region_z"]),
+        _stated_cell(Stated(**r["stated"])),
     )
     return f"| {r['capture']} | {' | '.join(cells)} |"
 
@@ -211,6 +222,9 @@ def pooled_row(results: Sequence[dict[str, Any]]) -> str:
             np.median(every("half_width"), axis=0),
             np.concatenate([r["region_z"] for r in results]),
         ),
+        _stated_cell(
+            Stated(*np.sum([tuple(r["stated"].values()) for r in results], 0))
+        ),
     )
     return f"| all {len(results)} | {' | '.join(cells)} |"
 
@@ -220,6 +234,13 @@ def _interval_cells(coverage: Any, half_width: Any, z: Any) -> tuple[str, str, s
         _triple(100 * np.asarray(coverage), ".0f"),
         _triple(100 * np.asarray(half_width), ".0f"),
         f"{np.mean(z):+.2f}, {np.std(z):.2f}",
+    )
+
+
+def _stated_cell(stated: Stated) -> str:
+    return (
+        f"{100 * stated.measured_inside / max(stated.measured, 1):.0f} "
+        f"{100 * stated.extrapolated_inside / max(stated.extrapolated, 1):.0f}"
     )
 
 

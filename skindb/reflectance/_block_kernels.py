@@ -7,6 +7,7 @@ Rows are formed and solved surfel by surfel, so that those of one surfel, 60 kB 
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -103,12 +104,9 @@ def _fit_rows(
 
 
 @kernel
-def _block_narrow(
-    half_width: Vector, count: int, ratio: float, b: Lumitexel, work: FitMemory
-) -> None:
-    """Block the columns whose peak no chosen sample shows, except the widest."""
-    limit = ratio * smallest_half_angle(count, b)
-    limit = min(limit, half_width.max())
+def _block_narrow(half_width: Vector, narrowest: float, work: FitMemory) -> None:
+    """Block the columns that are narrower than an angle, except the widest."""
+    limit = min(narrowest, half_width.max())
     for j in range(half_width.shape[0]):
         work.blocked[j] = half_width[j] < limit
 
@@ -126,6 +124,8 @@ def fit_block(block: Block, tables: Tables, options: Options, out: SurfaceFit) -
             continue
         count = write_rows(block.normal[s], table, b)
         out.samples[s] = count
+        seen = smallest_half_angle(count, b)
+        out.half_angle[s] = math.degrees(seen)
         if count < options.min_samples:
             out.status[s] = FEW
             continue
@@ -135,7 +135,7 @@ def fit_block(block: Block, tables: Tables, options: Options, out: SurfaceFit) -
             _cube_roots(count, b)
         x = out.parameters[s]
         if options.solve:
-            _block_narrow(tables.half_width, count, options.min_width, b, work)
+            _block_narrow(tables.half_width, options.min_width * seen, work)
             out.kkt[s], out.iterations[s], converged, out.condition[s] = _fit_rows(
                 count, lift, options, x, b, work
             )
@@ -273,7 +273,8 @@ def judge_block(
         split_diffuse(block.diffuse[s], count, b)
         weigh(s, count, block.noise, options, b)
         if options.solve:
-            _block_narrow(tables.half_width, count, options.min_width, b, work)
+            seen = smallest_half_angle(count, b)
+            _block_narrow(tables.half_width, options.min_width * seen, work)
             _fit_rows(count, lift, options, x, b, work)
             if options.mode == PERCEPTUAL:
                 predict(b.rows, count, x, b.surface, work.single)

@@ -35,6 +35,7 @@ from skindb.reflectance._lumitexel_kernels import (
     relative_drift,
     relative_errors,
     root_memory,
+    smallest_half_angle,
     split_diffuse,
     surface_factor,
     turned_normals,
@@ -305,6 +306,7 @@ def fit_ggx(block: Block, index: float, options: Options, out: SurfaceFit) -> No
             continue
         count = write_samples(b)
         out.samples[s] = count
+        out.half_angle[s] = math.degrees(smallest_half_angle(count, b))
         if count < options.min_samples:
             out.status[s] = FEW
             continue

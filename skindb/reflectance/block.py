@@ -33,6 +33,7 @@ FIT_VARIABLES = (
     variables.FIT_RESIDUAL_PERCEPTUAL,
     variables.FIT_CONDITION,
     variables.FIT_SAMPLES,
+    variables.SMALLEST_HALF_ANGLE,
     variables.FIT_ITERATIONS,
     variables.FIT_STATUS,
 )
@@ -71,6 +72,7 @@ def empty_fit(n: int, size: int, parameters: Array | None = None) -> SurfaceFit:
         residual_perceptual=np.full(n, np.nan),
         condition=np.full(n, np.nan),
         samples=np.zeros(n, np.int32),
+        half_angle=np.full(n, np.nan),
         iterations=np.zeros(n, np.int32),
         status=np.zeros(n, np.uint8),
     )

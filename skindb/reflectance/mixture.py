@@ -59,6 +59,7 @@ DICTIONARY_VARIABLES = (  # in the order of `SurfaceFit`
     variables.DICTIONARY_RESIDUAL_PERCEPTUAL,
     variables.FIT_CONDITION,
     variables.FIT_SAMPLES,
+    variables.SMALLEST_HALF_ANGLE,
     variables.FIT_ITERATIONS,
     variables.FIT_STATUS,
 )

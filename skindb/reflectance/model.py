@@ -83,6 +83,8 @@ class SurfaceFit(NamedTuple):
     # `MAX_CONDITION_TRUSTED` are doubtful
     condition: Array
     samples: NDArray[Any]
+    # smallest angle between the normal and a half vector of the samples [degree]
+    half_angle: Array
     iterations: NDArray[Any]
     status: NDArray[Any]
 

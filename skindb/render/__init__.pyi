@@ -6,7 +6,7 @@ from .photographs import (
 )
 from .rendering import render, render_picture
 from .scene import Camera, Environment, Lights
-from .surfels import evaluate
+from .surfels import evaluate, evaluate_error
 
 __all__ = [
     "Camera",
@@ -15,6 +15,7 @@ __all__ = [
     "compare_images",
     "compare_photographs",
     "evaluate",
+    "evaluate_error",
     "field_figure",
     "render",
     "render_picture",

@@ -6,6 +6,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from skindb.errors import Fault, InputError
 from skindb.reflectance.kinds import even_diffuse, surface_model
@@ -23,6 +24,13 @@ STATUS = {FitStatus.FITTED: TexelStatus.MEASURED} | dict.fromkeys(
 # confidence by `TexelStatus`
 TRUST = np.array([1.0, 0.5, 0.5, 0.5, 0.0, 0.0, 0.0], np.float32)
 NEEDED = (variables.SHADING_NORMAL, variables.DIFFUSE_REFLECTANCE, variables.FIT_STATUS)
+ERROR_INPUTS = (
+    variables.DIFFUSE_REFLECTANCE_TOTAL_ERROR,
+    variables.SURFACE_REFLECTANCE,
+    variables.SURFACE_REFLECTANCE_ERROR,
+    variables.FIT_RESIDUAL,
+    variables.SMALLEST_HALF_ANGLE,
+)
 MAX_LENGTH_ERROR = 1e-3  # of a unit direction; directions in half precision have 5e-4
 
 
@@ -156,16 +164,124 @@ def evaluate(
         )
     )
     points = Points(np.zeros_like(to_light), normal, to_camera, diffuse, parameters)
+    eta = float(fitted[variables.REFRACTIVE_INDEX])
+    f_r = _brdfs(reflectance, points, to_light, eta)
+    return np.asarray(f_r.reshape(shape), np.float32)
+
+
+def evaluate_error(
+    model: xr.DataTree, surfel: int, wi: ArrayLike, wo: ArrayLike
+) -> NDArray[np.float32]:
+    """Standard error of `evaluate`, which grows towards directions that nobody measured.
+
+    The square root of the sum of the squares of
+
+    - F_t(wi) F_t(wo) / pi times the total error of R_d,
+    - the surface term times the relative error of `surface_reflectance`,
+    - f_r times the relative residual of the fit, for what the model cannot describe,
+    - if the angle theta_h is below `smallest_half_angle`: the difference between the
+      surface term and that at this angle, which the model extrapolates.
+
+    Held-out samples with known truth are within 1.96 times this error at the rates in
+    docs/validation.md.
+
+    Parameters
+    ----------
+    model, surfel, wi, wo
+        As in `evaluate`; the model is one that was fitted, not edited.
+
+    Returns
+    -------
+    ndarray
+        (..., 3) float32 [sr^-1]; NaN where an error is not stated, and 0 where f_r is.
+
+    Raises
+    ------
+    InputError
+        As `evaluate`.
+    """
+    fitted = model["fitted"].to_dataset()
+    surface = surface_model(model["basis"].to_dataset())
+    check(fitted, ERROR_INPUTS, where="fitted")
+    _values_of(fitted, surfel, surface)
+    to_light, to_camera = np.broadcast_arrays(_unit("wi", wi), _unit("wo", wo))
+    shape = to_light.shape
+    to_light = to_light.reshape(-1, 3)
+    to_camera = to_camera.reshape(-1, 3)
+    rows = fitted.isel(surfel=np.full(len(to_light), surfel))
+    errors = reflectance_errors(rows, surface, to_light, to_camera)
+    return np.asarray(errors.reshape(shape), np.float32)
+
+
+def reflectance_errors(
+    fitted: xr.Dataset, surface: ReflectanceModel, to_light: Array, to_camera: Array
+) -> Array:
+    """`evaluate_error` (n, 3) of n surfels for unit directions (n, 3), one of each."""
+    eta = float(fitted[variables.REFRACTIVE_INDEX])
+    normal = fitted[variables.SHADING_NORMAL].values.astype(np.float64)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    parameters = surface.parameters_of(fitted)
+    none = np.zeros((len(normal), 0))
+    points = Points(
+        np.zeros_like(normal), normal, to_camera, even_diffuse(fitted), parameters
+    )
+    total = _brdfs(surface, points, to_light, eta)
+    gloss = points._replace(diffuse=np.zeros_like(normal))
+    shown = _brdfs(surface, gloss, to_light, eta)
+    turn = _to_measured(fitted, normal, to_light, to_camera)
+    turned = gloss._replace(view=turn.apply(to_camera))
+    measured = _brdfs(surface, turned, turn.apply(to_light), eta)
+    unit = points._replace(diffuse=np.ones_like(normal), parameters=none)
+    through = _brdfs(surface, unit, to_light, eta)
+    albedo = fitted[variables.SURFACE_REFLECTANCE].values[:, None]
+    relative = np.divide(
+        fitted[variables.SURFACE_REFLECTANCE_ERROR].values[:, None],
+        albedo,
+        out=np.zeros_like(albedo),
+        where=albedo > 0,
+    )
+    parts = (
+        through * fitted[variables.DIFFUSE_REFLECTANCE_TOTAL_ERROR].values,
+        relative * shown,
+        fitted[variables.FIT_RESIDUAL].values[:, None] * total,
+        shown - measured,
+    )
+    return np.asarray(np.sqrt(sum(part**2 for part in parts)))
+
+
+def _to_measured(
+    fitted: xr.Dataset, normal: Array, to_light: Array, to_camera: Array
+) -> Rotation:
+    """Rotations that bring the half vectors to the smallest angle that was measured; theta_d
+    and phi_d stay. Where the half vector is the normal, it leaves the plane of incidence.
+    """
+    half = to_light + to_camera
+    half /= np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-12)
+    axis = np.cross(normal, half)
+    sine = np.linalg.norm(axis, axis=1, keepdims=True)
+    across = to_light - to_camera
+    tangent = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
+    flat = np.linalg.norm(across, axis=1, keepdims=True) < 1e-6
+    axis = np.where(sine > 1e-6, axis, np.where(flat, tangent, across))
+    axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-12)
+    angle = np.arctan2(sine[:, 0], np.einsum("nc,nc->n", normal, half))
+    seen = np.radians(fitted[variables.SMALLEST_HALF_ANGLE].values.astype(np.float64))
+    return Rotation.from_rotvec(np.maximum(seen - angle, 0.0)[:, None] * axis)
+
+
+def _brdfs(
+    surface: ReflectanceModel, points: Points, to_light: Array, eta: float
+) -> Array:
+    """f_r (n, 3) [sr^-1]; 0 where a direction is not above the horizon."""
     lit = np.ones((len(to_light), 1), np.float32)
     lamp = Lamp(to_light[:, None], lit, np.zeros(3), 0.0)
-    radiance = reflectance.shade(
-        points, lamp, eta=float(fitted[variables.REFRACTIVE_INDEX])
-    )
+    radiance = surface.shade(points, lamp, eta=eta)
     # for a lamp at a distance of 1 mm, radiance per radiant intensity is f_r cos(theta_i) per mm2
-    cosine = np.einsum("nc,nc->n", normal, to_light)[:, None]
-    above = (cosine > 0) & (np.einsum("nc,nc->n", normal, to_camera)[:, None] > 0)
+    cosine = np.einsum("nc,nc->n", points.normal, to_light)[:, None]
+    seen = np.einsum("nc,nc->n", points.normal, points.view)[:, None]
+    above = (cosine > 0) & (seen > 0)
     f_r = np.divide(radiance, cosine, out=np.zeros(radiance.shape), where=above)
-    return np.asarray(f_r.reshape(shape), np.float32)
+    return np.asarray(f_r)
 
 
 def _values_of(

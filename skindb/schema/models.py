@@ -158,6 +158,10 @@ FIT_SAMPLES = declare(
     "int32 fitted/fit_samples(surfel) [1]",
     "samples used by the fit of the dictionary",
 )
+SMALLEST_HALF_ANGLE = declare(
+    "float32 fitted/smallest_half_angle(surfel) [degree]",
+    "smallest angle between the normal and a half vector of the samples that were fitted",
+)
 FIT_ITERATIONS = declare(
     "int32 fitted/fit_iterations(surfel) [1]",
     "steps of the active set in the fit of the dictionary",

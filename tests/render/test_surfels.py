@@ -10,7 +10,7 @@ from scipy.interpolate import RegularGridInterpolator
 from skindb.errors import InputError
 from skindb.optics.angles import half_difference
 from skindb.reflectance.tables import TableGrid, brdf_coords, stored_brdf
-from skindb.render import evaluate
+from skindb.render import evaluate, evaluate_error
 from skindb.schema import FitStatus, dataset
 
 ETA = 1.35
@@ -122,6 +122,86 @@ def test_evaluate__is_the_same_for_a_lazy_model(model):
     lazy = model.chunk({"surfel": 2})
     wi, wo = _pairs(model, 1, 12)
     np.testing.assert_array_equal(evaluate(lazy, 1, wi, wo), evaluate(model, 1, wi, wo))
+
+
+SEEN = 20.0  # degrees, of the surfels of `with_errors`
+
+
+@pytest.fixture(scope="module")
+def with_errors(model) -> xr.DataTree:
+    """The model with errors and a smallest measured half angle."""
+    rng = np.random.default_rng(4)
+    n = model["fitted"].sizes["surfel"]
+    errors = {
+        "diffuse_reflectance_total_error": rng.uniform(0.01, 0.05, (n, 3)),
+        "surface_reflectance": np.full(n, 0.04),
+        "surface_reflectance_error": rng.uniform(0.001, 0.01, n),
+        "fit_residual": rng.uniform(0.01, 0.1, n),
+        "smallest_half_angle": np.full(n, SEEN),
+    }
+    fitted = model["fitted"].to_dataset().merge(dataset(errors))
+    return xr.DataTree.from_dict(
+        {"fitted": fitted, "basis": model["basis"].to_dataset()}
+    )
+
+
+def _at_half_angle(normal, theta_h, count=300, seed=5):
+    """Pairs with a half angle, whose directions stay above the horizon when it becomes SEEN."""
+    rng = np.random.default_rng(seed)
+    frame = np.linalg.svd(normal[None])[2]
+    frame[0] = normal
+    frame[1] = np.cross(frame[2], normal)
+    theta_d, phi_h, phi_d = rng.uniform(
+        [[0.1], [0], [0]], [[1.0], [6], [6]], (3, count)
+    )
+    spin = np.exp(1j * phi_h)
+    pair = []
+    for sign in (1, -1):
+        x, y, z = (
+            sign * np.sin(theta_d) * np.cos(phi_d),
+            sign * np.sin(theta_d) * np.sin(phi_d),
+            np.cos(theta_d),
+        )
+        turned = np.cos(theta_h) * x + np.sin(theta_h) * z
+        z = np.cos(theta_h) * z - np.sin(theta_h) * x
+        plane = (turned + 1j * y) * spin
+        pair.append(np.stack([z, plane.real, plane.imag], axis=-1) @ frame)
+    return pair
+
+
+@pytest.mark.parametrize("theta_h", [5.0, 25.0])
+def test_evaluate_error__is_the_sum_of_its_parts(with_errors, theta_h):
+    """The same pairs at the measured half angle are made independently by spherical
+    coordinates; above it nothing is extrapolated.
+    """
+    surfel = 1
+    fitted = with_errors["fitted"].isel(surfel=surfel)
+    normal = _unit(fitted["shading_normal"].values.astype(float))
+    wi, wo = _at_half_angle(normal, np.radians(theta_h))
+    through = _transmittance(wi @ normal) * _transmittance(wo @ normal) / np.pi
+    total = _oracle(with_errors, surfel, wi, wo)
+    diffuse = through[:, None] * fitted["diffuse_reflectance"].values
+    measured = _at_half_angle(normal, np.radians(max(theta_h, SEEN)))
+    seen_diffuse = np.prod([_transmittance(w @ normal) for w in measured], axis=0)
+    seen = _oracle(with_errors, surfel, *measured) - (
+        seen_diffuse[:, None] / np.pi * fitted["diffuse_reflectance"].values
+    )
+    gloss = total - diffuse
+    want = (
+        (through[:, None] * fitted["diffuse_reflectance_total_error"].values) ** 2
+        + (float(fitted["surface_reflectance_error"]) / 0.04 * gloss) ** 2
+        + (float(fitted["fit_residual"]) * total) ** 2
+        + (gloss - seen) ** 2
+    )
+    found = evaluate_error(with_errors, surfel, wi, wo)
+    np.testing.assert_allclose(found, np.sqrt(want), rtol=1e-3)
+    extrapolated = np.abs(gloss - seen) > 1e-3
+    assert extrapolated.any() == (theta_h < SEEN)
+
+
+def test_evaluate_error__refuses_a_model_without_errors(model):
+    with pytest.raises(InputError, match="diffuse_reflectance_total_error"):
+        evaluate_error(model, 1, [0, 0, 1], [0, 0, 1])
 
 
 @pytest.mark.parametrize("surfel", [-1, 6, 1000])
