@@ -107,8 +107,14 @@ def _not_opened(path: Path, error: OSError) -> InputError:
         return InputError(Fault(where, "the file must exist", found, CURE_MISSING))
     if not stat.S_ISREG(mode):
         return _of_kind(where, mode)
-    cure = "check its permissions and the disk"
-    return InputError(Fault(where, "the file must be readable", found, cure))
+    return InputError(
+        Fault(
+            where,
+            "the file must be readable",
+            found,
+            "check its permissions and the disk",
+        )
+    )
 
 
 def _of_kind(where: str, mode: int) -> InputError:

@@ -324,9 +324,14 @@ def compare_groups(
             associated = associations(contrast, subjects, attributes)
             flags = contrast_flags(contrast, subjects, associated, adjust)
         except ValueError as error:
-            rule = "the subjects must determine the effect"
-            cure = "adjust for fewer attributes, compare other groups, or add subjects"
-            faults.append(Fault(contrast.name, rule, str(error), cure))
+            faults.append(
+                Fault(
+                    contrast.name,
+                    "the subjects must determine the effect",
+                    str(error),
+                    "adjust for fewer attributes, compare other groups, or add subjects",
+                )
+            )
         else:
             compared.append(Comparison(contrast, result, associated, flags))
     return compared, faults

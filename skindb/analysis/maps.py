@@ -115,9 +115,15 @@ def effect_maps(
     compare = partial(compare_groups, cohort, group_by, adjust, statistics=test)
     parts, flags, faults = _variable_maps(cohort, size, compare)
     if not parts:
-        rule = "some texels must be measured"
-        cure = "fit or register more takes"
-        raise InputError(faults or Fault("maps", rule, "none", cure))
+        raise InputError(
+            faults
+            or Fault(
+                "maps",
+                "some texels must be measured",
+                "none",
+                "fit or register more takes",
+            )
+        )
     quantities = [name for part in parts for name in part.quantities]
     logarithmic = [name for name in quantities if name.startswith(LOGARITHMIC)]
     flags += notes_on_attributes(subjects_of(cohort))
@@ -189,8 +195,14 @@ def _variable_maps(
         maps = _VariableMaps.of(cohort[variable], compared, size)
         # a contrast is missing for this variable only
         if parts and maps.contrasts != parts[0].contrasts:
-            rule = "every comparison must have texels"
-            faults.append(Fault(title, rule, "none for some", "exclude takes"))
+            faults.append(
+                Fault(
+                    title,
+                    "every comparison must have texels",
+                    "none for some",
+                    "exclude takes",
+                )
+            )
         else:
             parts.append(maps)
     return parts, flags, faults

@@ -289,12 +289,14 @@ def trait_name(name: str, candidates: Iterable[str]) -> str:
     meant = [trait for trait in traits if trait.partition(":")[2] == name]
     if len(meant) == 1:
         return meant[0]
-    rule = "must name exactly one trait of the population"
     finding = (
         f"{len(meant)} matches: {', '.join(meant)}" if meant else "an unknown name"
     )
     raise input_error(
-        f"trait {name}", rule, finding, f"choose from: {', '.join(traits) or 'none'}"
+        f"trait {name}",
+        "must name exactly one trait of the population",
+        finding,
+        f"choose from: {', '.join(traits) or 'none'}",
     )
 
 

@@ -324,11 +324,10 @@ def _units(
     complete = np.isfinite(design).all(axis=1)
     design = design[complete]
     if np.linalg.matrix_rank(design) < np.linalg.matrix_rank(design[:, 1:]) + 1:
-        rule = "must vary independently of the attributes that are adjusted for"
         finding = ", ".join(adjust) or "one value"
         raise input_error(
             f"trait {trait}",
-            rule,
+            "must vary independently of the attributes that are adjusted for",
             finding,
             "adjust for fewer attributes, or exclude the trait",
         )

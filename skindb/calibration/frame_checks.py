@@ -209,9 +209,12 @@ def _saturated_fault(
 ) -> Fault | None:
     """Fault of a picture that is at the white level everywhere, in every exposure."""
     if all((frame >= sensor.white).all() for frame in frames):
-        rule = "a photograph must not be saturated everywhere"
-        cure = "take it with a shorter exposure"
-        return Fault(place, rule, "no value below white_level", cure)
+        return Fault(
+            place,
+            "a photograph must not be saturated everywhere",
+            "no value below white_level",
+            "take it with a shorter exposure",
+        )
     return None
 
 
@@ -460,13 +463,15 @@ def dark_pattern_fault(
     minimum = max(MIN_CORRELATION * spread, MIN_CORRELATION_RATIO * agreement(thinned))
     for finding, frame in _alternatives(camera, mergers, shortest):
         if agreement(frame[::step]) > minimum:
-            rule = "dark frames must show the pattern of the sensor where the photographs show it"
             cure = (
                 "write them like the photographs: in the same orientation, under the "
                 "id of their camera"
             )
             return Fault(
-                f"{dome.file}[dark]", rule, f"camera {camera}: {finding}", cure
+                f"{dome.file}[dark]",
+                "dark frames must show the pattern of the sensor where the photographs show it",
+                f"camera {camera}: {finding}",
+                cure,
             )
     return None
 

@@ -166,9 +166,13 @@ def _pixels_at_edge(
 
 
 def _require_edge(satisfied: object, finding: str) -> None:
-    rule = "the picture must show one edge that is slanted by 2 to 45 degrees from the columns"
-    cure = "turn the edge by about 5 degrees, and select the edge alone"
-    require(satisfied, "slanted edge", rule, finding, cure)
+    require(
+        satisfied,
+        "slanted edge",
+        "the picture must show one edge that is slanted by 2 to 45 degrees from the columns",
+        finding,
+        "turn the edge by about 5 degrees, and select the edge alone",
+    )
 
 
 @dataclass(frozen=True)

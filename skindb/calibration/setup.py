@@ -75,9 +75,12 @@ def read_setup_dome(
         }
     dome = read_dome(folder, fields, face=False, calibrated=True)
     if white and dome.white is None and not fields.faults:
-        rule = "a calibration needs the frames of a white target"
-        cure = "photograph it, see docs/capture_format.md"
-        fields.fault("white", rule, "none", cure)
+        fields.fault(
+            "white",
+            "a calibration needs the frames of a white target",
+            "none",
+            "photograph it, see docs/capture_format.md",
+        )
     if fields.faults:
         raise InputError(fields.faults)
     return dome
@@ -271,8 +274,9 @@ def _places(
     for name, place in places.items():
         size = (cameras[name].width, cameras[name].height)
         if (place < 0).any() or (place > size).any():
-            rule = "must lie inside the picture of the camera"
-            by_camera.fault(name, rule, shown(place))
+            by_camera.fault(
+                name, "must lie inside the picture of the camera", shown(place)
+            )
     return places
 
 
@@ -333,8 +337,11 @@ def _outlines(dome: DomeRecord, circles: Fields) -> dict[str, Float64]:
         ):
             outlines[name] = circle
         else:
-            rule = "column, row and radius must be those of a circle in the picture"
-            circles.fault(name, rule, shown(circle))
+            circles.fault(
+                name,
+                "column, row and radius must be those of a circle in the picture",
+                shown(circle),
+            )
     return outlines
 
 

@@ -164,10 +164,16 @@ def main() -> None:
         echo(*stream.getvalue().expandtabs(2).splitlines(), err=True)
         context = getattr(error, "ctx", None)
         command = context.command_path if context else "skindb"
-        rule = "must be called as its --help says"
         _give_up(
             error.exit_code,
-            [Fault(command, rule, error.format_message(), f"see {command} --help")],
+            [
+                Fault(
+                    command,
+                    "must be called as its --help says",
+                    error.format_message(),
+                    f"see {command} --help",
+                )
+            ],
         )
     except (click.Abort, KeyboardInterrupt):
         message = "interrupted; no incomplete version was committed"

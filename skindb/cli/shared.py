@@ -257,9 +257,14 @@ def existing(db: str) -> Database:
     begun = {"audit", "data", "leases", "secret", "staging", "tmp"}
     # a bucket without records has no log
     has_log = bool({"log", "tombstones", "withdrawn"} & entries)
-    rule = "a database must have a log"
     cure = "give the folder of the database"
-    require(has_log or entries <= begun, db, rule, "a folder without one", cure)
+    require(
+        has_log or entries <= begun,
+        db,
+        "a database must have a log",
+        "a folder without one",
+        cure,
+    )
     return database
 
 
@@ -278,23 +283,37 @@ def chosen_takes(
 
 def require_one_take(out: Path, takes: Sequence[str]) -> None:
     """Check that a file gets one take."""
-    rule = "a file must hold one take"
-    cure = "name a folder, or one take"
-    require(len(takes) <= 1, str(out), rule, f"{len(takes)} takes", cure)
+    require(
+        len(takes) <= 1,
+        str(out),
+        "a file must hold one take",
+        f"{len(takes)} takes",
+        "name a folder, or one take",
+    )
 
 
 def writable(path: Path, *endings: str) -> None:
     """Check the name and folder of a file before the work of which it is the result."""
-    rule = f"must end in {' or '.join(endings)}"
     ending = path.suffix or "no ending"
-    require(path.suffix.lower() in endings, str(path), rule, ending, "rename it")
+    require(
+        path.suffix.lower() in endings,
+        str(path),
+        f"must end in {' or '.join(endings)}",
+        ending,
+        "rename it",
+    )
     require_folder(path)
 
 
 def require_folder(path: Path) -> None:
     """Check that the folder of a file exists."""
-    cure = f"make {path.parent}"
-    require(path.parent.is_dir(), str(path), "its folder must exist", "none", cure)
+    require(
+        path.parent.is_dir(),
+        str(path),
+        "its folder must exist",
+        "none",
+        f"make {path.parent}",
+    )
 
 
 def summary_of(record: Record) -> dict[str, Any]:
@@ -345,8 +364,12 @@ def trait_amounts(
             raise click.UsageError(
                 f"--trait needs {form}, such as lotion=0.5; found {text!r}"
             )
-        rule = "must name each trait once"
-        repeated = f"{name} more than once"
-        require(name not in amounts, "--trait", rule, repeated, "give one amount")
+        require(
+            name not in amounts,
+            "--trait",
+            "must name each trait once",
+            f"{name} more than once",
+            "give one amount",
+        )
         amounts[name] = amount
     return amounts

@@ -49,9 +49,13 @@ def consent(db: str, subject: str, scope: str | None) -> None:
     if scope is not None:
         names = [name for part in scope.split(",") if (name := part.strip())]
         if not names or ("none" in names and len(names) > 1):
-            rule = "must name scopes, or be the single word none"
             text = repr(scope)
-            raise input_error("--scope", rule, text, "for example fit,statistics")
+            raise input_error(
+                "--scope",
+                "must name scopes, or be the single word none",
+                text,
+                "for example fit,statistics",
+            )
         names = [] if names == ["none"] else names
         skindb.workflow.record_consent(database, subject, names)
     history = database.consent_history(subject)

@@ -286,9 +286,13 @@ def export_bundle(
     try:
         make_private(staged)
     except OSError as error:
-        rule = "must be a folder that can be created"
         content = error.strerror or str(error)
-        raise input_error(str(target), rule, content, "choose another folder") from None
+        raise input_error(
+            str(target),
+            "must be a folder that can be created",
+            content,
+            "choose another folder",
+        ) from None
     try:
         described = _write_parts(model, staged, size, merl, report)
         manifest = _manifest(model, staged, described)

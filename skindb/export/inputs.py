@@ -73,11 +73,10 @@ def chosen_size(model: xr.DataTree, size: int | None) -> int:
     needed = BYTES_PER_TEXEL * side**2
     free = _free_memory()
     if needed > free:
-        rule = f"maps of {side} x {side} texels need {needed / 1e9:.1f} GB of memory"
         cure = "choose a smaller size"
         raise input_error(
             "size",
-            rule,
+            f"maps of {side} x {side} texels need {needed / 1e9:.1f} GB of memory",
             f"{free / 1e9:.1f} GB",
             f"{cure}, for example {texture_size(model)}",
         )
@@ -114,14 +113,17 @@ def required(model: xr.DataTree) -> xr.Dataset:
         .astype(float)
     )
     if not np.isfinite(corner).all() or not np.ptp(corner, axis=1).any():
-        rule = "texture coordinates must be finite and cover an area"
-        cure = "ingest and fit the capture again"
         fault = (
             "values that are not finite"
             if not np.isfinite(corner).all()
             else "no triangle with an area"
         )
-        raise input_error("fitted[surfel_uv]", rule, fault, cure)
+        raise input_error(
+            "fitted[surfel_uv]",
+            "texture coordinates must be finite and cover an area",
+            fault,
+            "ingest and fit the capture again",
+        )
     return fitted
 
 

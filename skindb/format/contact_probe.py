@@ -240,8 +240,12 @@ def _require_separate_fibres(fields: Fields, probe: ProbeRecord) -> None:
         fields.fault("fibres", rule, f"{distance.max():g} mm", cure)
     elif len(distance) > 1 and np.ptp(distance) == 0:
         rule = "a profile needs fibres at different distances"
-        finding = f"all {len(distance)} at {distance[0]:g} mm"
-        fields.fault("fibres", rule, finding, "give each fibre its own distance")
+        fields.fault(
+            "fibres",
+            rule,
+            f"all {len(distance)} at {distance[0]:g} mm",
+            "give each fibre its own distance",
+        )
     if probe.face > 0 and (distance < 2 * probe.face).any():
         i = int(distance.argmin())
         rule = (
@@ -252,8 +256,14 @@ def _require_separate_fibres(fields: Fields, probe: ProbeRecord) -> None:
             "distance is measured between the centres; both are in mm, and "
             "fibre_radius is not the diameter"
         )
-        place = f"{fields.where}[fibres][{i}][distance]"
-        fields.faults.append(Fault(place, rule, f"{distance[i]:g} mm", cure))
+        fields.faults.append(
+            Fault(
+                f"{fields.where}[fibres][{i}][distance]",
+                rule,
+                f"{distance[i]:g} mm",
+                cure,
+            )
+        )
     _require_separate_discs(fields, probe.centre, probe.radius)
 
 
@@ -270,8 +280,12 @@ def _require_separate_discs(fields: Fields, centre: Float64, radius: Float64) ->
             f"{count} pairs, such as {i} and {j}: {gap[i, j]:.3g} px apart, radii "
             f"{radius[i]:g} and {radius[j]:g} px"
         )
-        cure = "correct centre and radius, in pixels"
-        fields.fault("fibres", "fibres must not overlap in the picture", finding, cure)
+        fields.fault(
+            "fibres",
+            "fibres must not overlap in the picture",
+            finding,
+            "correct centre and radius, in pixels",
+        )
 
 
 def _require_even_gains(fields: Fields, gain: Float64) -> None:
@@ -283,5 +297,9 @@ def _require_even_gains(fields: Fields, gain: Float64) -> None:
     )
     for i, factor in enumerate(np.maximum(ratio, 1 / ratio).max(axis=1)):
         if factor > MAX_GAIN_RATIO:
-            cure = "measure the flat field of the fibre again"
-            fields.fault("gain", rule, f"{factor:.3g} times, of fibre {i}", cure)
+            fields.fault(
+                "gain",
+                rule,
+                f"{factor:.3g} times, of fibre {i}",
+                "measure the flat field of the fibre again",
+            )

@@ -205,9 +205,12 @@ def read_dome(
     elif not calibrated:
         unknown = [light.id for light in lights if light.intensity is None]
         if unknown:
-            rule = "lights need an intensity or a white target"
-            finding = f"{len(unknown)} lights without intensity, first {unknown[0]}"
-            fields.fault("white", rule, finding, "measure one of them")
+            fields.fault(
+                "white",
+                "lights need an intensity or a white target",
+                f"{len(unknown)} lights without intensity, first {unknown[0]}",
+                "measure one of them",
+            )
     # version 1 keeps the sequence as an unchecked attribute
     sequence = None
     if version > 1 and fields.has("sequence"):
@@ -232,8 +235,11 @@ def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:
     K, R = _matrices(item)
     colours = item.array("colour_matrix", (3, 3), default=np.eye(3).tolist())
     if not (colours.sum(axis=1) > 0).all():
-        rule = "must give white a positive R, G and B: each row sums to more than 0"
-        item.fault("colour_matrix", rule, shown(colours))
+        item.fault(
+            "colour_matrix",
+            "must give white a positive R, G and B: each row sums to more than 0",
+            shown(colours),
+        )
     width, height = _size(item)
     vignette = item.array("vignette", (3,), default=[0.0] * 3)
     lens = item.array("distortion", (5,), default=[0.0] * 5, fallback=0.0)
@@ -264,11 +270,16 @@ def _matrices(item: Fields) -> tuple[Float64, Float64]:
     error = np.abs(R @ R.T - np.eye(3)).max()
     determinant = np.linalg.det(R)
     if error > ROTATION_TOLERANCE or determinant < 0:
-        finding = f"R R^T differs from 1 by {error:.2g}, determinant {determinant:.3g}"
-        item.fault("R", "must be a rotation", finding, "calibrate the camera again")
+        item.fault(
+            "R",
+            "must be a rotation",
+            f"R R^T differs from 1 by {error:.2g}, determinant {determinant:.3g}",
+            "calibrate the camera again",
+        )
     if K[0, 0] <= 0 or K[1, 1] <= 0 or K[1, 0] != 0 or (K[2] != (0, 0, 1)).any():
-        rule = "must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels"
-        item.fault("K", rule, shown(K))
+        item.fault(
+            "K", "must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels", shown(K)
+        )
     return K, R
 
 
@@ -278,8 +289,12 @@ def _size(item: Fields) -> tuple[int, int]:
     height = item.integer("height", minimum=1)
     if width * height <= MAX_FRAME_PIXELS:
         return width, height
-    rule = f"a picture must have at most {MAX_FRAME_PIXELS:,} pixels"
-    item.fault("width", rule, f"{width} x {height}", "correct width and height")
+    item.fault(
+        "width",
+        f"a picture must have at most {MAX_FRAME_PIXELS:,} pixels",
+        f"{width} x {height}",
+        "correct width and height",
+    )
     return 1, 1
 
 
@@ -300,9 +315,12 @@ def _require_light(
         f"at most {MAX_VIGNETTE_GAIN:g} in the whole picture"
     )
     worst = gain.argmax() if gain.max() > MAX_VIGNETTE_GAIN else gain.argmin()
-    finding = f"{gain[worst]:.3g} at r = {np.sqrt(r2[worst]):.3g}"
-    cure = "r is 1 at half the image diagonal; measure the lens up to the corners"
-    item.fault("vignette", rule, finding, cure)
+    item.fault(
+        "vignette",
+        rule,
+        f"{gain[worst]:.3g} at r = {np.sqrt(r2[worst]):.3g}",
+        "r is 1 at half the image diagonal; measure the lens up to the corners",
+    )
 
 
 def _light(item: Fields) -> LightRecord:
@@ -329,9 +347,12 @@ def _polarisation(item: Fields) -> float:
     if hand is None:
         return 0.0
     if not isinstance(hand, str) or hand not in HANDS:
-        rule = "must be left or right, of circular polarisers, or null"
-        cure = "remove linear polarisers: they cross towards one camera only"
-        item.fault("polariser", rule, shown(hand), cure)
+        item.fault(
+            "polariser",
+            "must be left or right, of circular polarisers, or null",
+            shown(hand),
+            "remove linear polarisers: they cross towards one camera only",
+        )
         return 0.0
     leak = item.number("leak", minimum=0.0, maximum=MAX_LEAK, default=0.0)
     return HANDS[hand] * (1.0 - 2.0 * leak)
@@ -350,9 +371,12 @@ def _white(white: Fields, cameras: set[str], several: set[str]) -> WhiteRecord:
     normal = _direction(white, "normal")
     reflectance = white.number("reflectance", above=0.0)
     if reflectance > 1:
-        rule = "must be a fraction of the light, at most 1"
-        cure = "give a fraction instead of a percentage: 0.99 for 99 %"
-        white.fault("reflectance", rule, shown(reflectance), cure)
+        white.fault(
+            "reflectance",
+            "must be a fraction of the light, at most 1",
+            shown(reflectance),
+            "give a fraction instead of a percentage: 0.99 for 99 %",
+        )
     smallest, largest = TARGET_HALF_SIZES_MM
     record = WhiteRecord(
         frames=white.template("frames", {LIGHT, CAMERA} | several, {EXPOSURE}),
@@ -370,9 +394,12 @@ def _white(white: Fields, cameras: set[str], several: set[str]) -> WhiteRecord:
 def _check_frames(dome: DomeRecord, fields: Fields) -> None:
     """Check the headers of all frames that the folder must hold."""
     if dome.frame_count > MAX_FRAMES:
-        rule = f"a capture must have at most {MAX_FRAMES:,} frames"
-        finding = f"{dome.frame_count:,}: cameras x lights x exposures"
-        fields.fault("frames", rule, finding, "remove those that were not used")
+        fields.fault(
+            "frames",
+            f"a capture must have at most {MAX_FRAMES:,} frames",
+            f"{dome.frame_count:,}: cameras x lights x exposures",
+            "remove those that were not used",
+        )
         return
     parents = dict[Path, bool]()
     # for one light and camera, frames of the face and of the white target differ only
@@ -461,8 +488,12 @@ def _seconds(step: Fields, key: str) -> float:
     time = zoned_time(text)
     if time is not None:
         return time.timestamp()
-    rule = "must be a number of seconds, or an ISO 8601 time with its zone"
-    step.fault(key, rule, shown(text), SEQUENCE_CURE)
+    step.fault(
+        key,
+        "must be a number of seconds, or an ISO 8601 time with its zone",
+        shown(text),
+        SEQUENCE_CURE,
+    )
     return 0.0
 
 
@@ -483,6 +514,9 @@ def _require_distortion(item: Fields, lens: Float64, K: Float64, size: Float64) 
         f"1 + k1 r^2 + k2 r^4 + k3 r^6 must be {smallest:g} to {largest:g}, and 3 |p| r at "
         f"most {MAX_TANGENTIAL:g}, at the corners of the picture"
     )
-    finding = f"{radial:.3g} and {tangential:.3g} at r = {np.sqrt(r2):.3g}"
-    cure = "the order is k1, k2, p1, p2, k3, of distances over the focal length"
-    item.fault("distortion", rule, finding, cure)
+    item.fault(
+        "distortion",
+        rule,
+        f"{radial:.3g} and {tangential:.3g} at r = {np.sqrt(r2):.3g}",
+        "the order is k1, k2, p1, p2, k3, of distances over the focal length",
+    )

@@ -88,8 +88,12 @@ class Fields:
         if default is not REQUIRED:
             return default
         if self.is_object:
-            cure = "add it, see docs/capture_format.md"
-            self.fault(key, "this key is required", "nothing", cure)
+            self.fault(
+                key,
+                "this key is required",
+                "nothing",
+                "add it, see docs/capture_format.md",
+            )
         return None
 
     def object(self, key: str, default: Any = REQUIRED) -> Fields:
@@ -151,9 +155,12 @@ class Fields:
         hidden = sum(not character.isprintable() for character in value)
         if len(value) <= MAX_TEXT_CHARACTERS and not hidden:
             return True
-        rule = f"a text must be at most {MAX_TEXT_CHARACTERS} characters that can be printed"
-        found = f"{len(value)} characters, {hidden} of which cannot be printed"
-        self.fault(key, rule, found, "shorten or correct it")
+        self.fault(
+            key,
+            f"a text must be at most {MAX_TEXT_CHARACTERS} characters that can be printed",
+            f"{len(value)} characters, {hidden} of which cannot be printed",
+            "shorten or correct it",
+        )
         return False
 
     def number(
@@ -223,8 +230,9 @@ class Fields:
             array = np.full(shapes[0], np.inf)
         if (np.abs(array) <= MAX_MAGNITUDE).all():
             return array
-        rule = f"must be finite numbers, at most {MAX_MAGNITUDE:g}"
-        self.fault(key, rule, shown(value))
+        self.fault(
+            key, f"must be finite numbers, at most {MAX_MAGNITUDE:g}", shown(value)
+        )
         return None
 
     def gains(self, key: str, count: int) -> Float64:
@@ -253,12 +261,17 @@ class Fields:
             return ()
         for name in value:
             if not isinstance(name, str) or not re.fullmatch(IDENTIFIER.pattern, name):
-                rule = f"must be a list of names: each {IDENTIFIER.text}"
-                self.fault(key, rule, shown(name))
+                self.fault(
+                    key, f"must be a list of names: each {IDENTIFIER.text}", shown(name)
+                )
                 return ()
         if len(value) < minimum:
-            cure = "give at least one name, or remove the enclosing part"
-            self.fault(key, "must be a list of at least one name", shown(value), cure)
+            self.fault(
+                key,
+                "must be a list of at least one name",
+                shown(value),
+                "give at least one name, or remove the enclosing part",
+            )
         self._require_unique(key, value)
         return tuple(value)
 
@@ -289,8 +302,12 @@ class Fields:
     def _require_unique(self, key: str, ids: list[Any]) -> None:
         count = Counter(i for i in ids if isinstance(i, str))
         if repeated := sorted(name for name, times in count.items() if times > 1):
-            found = f"{short(', '.join(repeated))} more than once"
-            self.fault(key, "ids must differ", found, "rename them")
+            self.fault(
+                key,
+                "ids must differ",
+                f"{short(', '.join(repeated))} more than once",
+                "rename them",
+            )
 
     def template(
         self,
@@ -305,8 +322,9 @@ class Fields:
         try:
             parts = [part for part in Formatter().parse(value) if part[1] is not None]
         except ValueError as error:
-            rule = "must be a path with placeholders"
-            self.fault(key, rule, f"{short(value)}: {error}")
+            self.fault(
+                key, "must be a path with placeholders", f"{short(value)}: {error}"
+            )
             return ""
         names = {name for _, name, _, _ in parts}
         formatted = any(spec or conversion for _, _, spec, conversion in parts)
@@ -384,8 +402,9 @@ def _unique_pairs(
     """The object of these pairs; repeated keys, and more than `MAX_OBJECT_KEYS`, are faults."""
     if len(pairs) > MAX_OBJECT_KEYS:
         rule = f"a JSON object must have at most {MAX_OBJECT_KEYS} keys"
-        cure = "remove those that are not needed"
-        faults.append(Fault(where, rule, f"{len(pairs)}", cure))
+        faults.append(
+            Fault(where, rule, f"{len(pairs)}", "remove those that are not needed")
+        )
         return dict(pairs)
     count = Counter(key for key, _ in pairs)
     rule = "an object must have each key once"

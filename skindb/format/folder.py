@@ -140,9 +140,12 @@ def read_capture(path: str | Path, *, crop: Crop | None = None) -> Capture:
     for key, choices in (("format", (FORMAT,)), ("version", VERSIONS)):
         value = fields.get(key)
         if value is not None and (value not in choices or isinstance(value, bool)):
-            rule = f"must be {' or '.join(map(json.dumps, choices))}, which this skindb reads"
-            cure = "update skindb, or write this version"
-            fields.fault(key, rule, shown(value), cure)
+            fields.fault(
+                key,
+                f"must be {' or '.join(map(json.dumps, choices))}, which this skindb reads",
+                shown(value),
+                "update skindb, or write this version",
+            )
             raise InputError(fields.faults)
     reader = _Reader(folder, fields, crop)
     capture = reader.capture()
@@ -224,9 +227,12 @@ class _Reader:
             "traits": self._traits(),
         }
         if record["session"] and zoned_time(record["session"]) is None:
-            rule = "must be an ISO 8601 time with its zone"
-            cure = "write it like 2005-01-10T09:00:00+01:00"
-            fields.fault("session", rule, shown(record["session"]), cure)
+            fields.fault(
+                "session",
+                "must be an ISO 8601 time with its zone",
+                shown(record["session"]),
+                "write it like 2005-01-10T09:00:00+01:00",
+            )
         record["consent_scope"], record["consent_reference"] = self._consent()
         record["calibration"] = ""
         if self._has_in_version_2("calibration"):
@@ -265,8 +271,12 @@ class _Reader:
         for name, value in traits.data.items():
             if imitates_column(name):
                 rule = "an attribute must not have the name of another column of the catalogue"
-                cure = "rename it, for example skin_condition"
-                traits.fault(name, rule, f"the name {short(name)}", cure)
+                traits.fault(
+                    name,
+                    rule,
+                    f"the name {short(name)}",
+                    "rename it, for example skin_condition",
+                )
             if isinstance(value, str):
                 traits.require_printable(name, value)
             elif not isinstance(value, bool) and not (
@@ -285,8 +295,9 @@ class _Reader:
         consent = self.fields.object("consent")
         scope = consent.names("scope", minimum=0, maximum=len(SCOPES))
         if unknown := [name for name in scope if name not in SCOPES]:
-            rule = f"must be from {', '.join(SCOPES)}"
-            consent.fault("scope", rule, short(", ".join(unknown)))
+            consent.fault(
+                "scope", f"must be from {', '.join(SCOPES)}", short(", ".join(unknown))
+            )
         return scope, consent.text("reference")
 
     def _override(self) -> dict[str, Any]:
@@ -301,12 +312,13 @@ class _Reader:
         for key in OVERRIDE:
             value = override.get(key)
             if value is not None and value is not True:
-                rule = "must be true: the operator confirmed it"
                 cure = (
                     "a subject who was not screened must not be photographed above 3 "
                     "flashes per second"
                 )
-                override.fault(key, rule, shown(value), cure)
+                override.fault(
+                    key, "must be true: the operator confirmed it", shown(value), cure
+                )
         return {**override.data, "operator": operator, "time": time}
 
     def _has_in_version_2(self, key: str) -> bool:
@@ -326,10 +338,14 @@ class _Reader:
             ]
             return None, None
         if len(surface.faces) < max(2, 0.1 * len(scan.faces)):
-            rule = "the triangles of a scan must share edges"
-            found = f"{len(surface.faces)} connected ones of {len(scan.faces)}"
-            cure = "export the scan as one connected surface"
-            self.faults.append(Fault(self.mesh_place, rule, found, cure))
+            self.faults.append(
+                Fault(
+                    self.mesh_place,
+                    "the triangles of a scan must share edges",
+                    f"{len(surface.faces)} connected ones of {len(scan.faces)}",
+                    "export the scan as one connected surface",
+                )
+            )
             return scan, None
         self.unit_faults += scan_faults(self.mesh_place, surface)
         return scan, surface
@@ -376,9 +392,14 @@ class _Reader:
                 for corner in (np.min(scan.vertices, 0), np.max(scan.vertices, 0))
             )
             rule = "the crop must leave a part of the scan"
-            finding = f"{keep.sum()} of {len(keep)} triangles"
-            cure = f"the scan reaches from {low} to {high} mm"
-            self.faults.append(Fault(self.mesh_place, rule, finding, cure))
+            self.faults.append(
+                Fault(
+                    self.mesh_place,
+                    rule,
+                    f"{keep.sum()} of {len(keep)} triangles",
+                    f"the scan reaches from {low} to {high} mm",
+                )
+            )
             return surface
 
     def _landmarks(
@@ -457,9 +478,11 @@ class _Reader:
         if name is not None and not str(name).lower().endswith(".json"):
             path = self._path("regions")
             if path is not None and not path.is_file():
-                cure = "correct its name, or remove the key"
                 self.fields.fault(
-                    "regions", "the file must exist", short(str(path)), cure
+                    "regions",
+                    "the file must exist",
+                    short(str(path)),
+                    "correct its name, or remove the key",
                 )
             self.skipped.append(
                 "regions: only vertex lists (JSON) can be read; there are no regions"
@@ -470,10 +493,12 @@ class _Reader:
         if fields is None or scan is None or not fields.at_most(MAX_REGIONS, "regions"):
             return {}
         if WHOLE_SURFACE in fields.data:
-            rule = (
-                f"`{WHOLE_SURFACE}` is the name of the entire surface in every report"
+            fields.fault(
+                WHOLE_SURFACE,
+                f"`{WHOLE_SURFACE}` is the name of the entire surface in every report",
+                "a region of that name",
+                "rename it",
             )
-            fields.fault(WHOLE_SURFACE, rule, "a region of that name", "rename it")
         regions = dict[str, Index]()
         for name in fields.data:
             vertices = _vertices(fields, name, len(scan.vertices))
@@ -530,10 +555,14 @@ class _Reader:
                     "position is unknown"
                 )
             elif not len(regions[site]):
-                place = f"{self.folder / str(self.fields.get('regions'))}[{site}]"
-                rule = "a region that the probe measured must have vertices"
-                cure = "list its vertices, or remove the region"
-                self.faults.append(Fault(place, rule, "none", cure))
+                self.faults.append(
+                    Fault(
+                        f"{self.folder / str(self.fields.get('regions'))}[{site}]",
+                        "a region that the probe measured must have vertices",
+                        "none",
+                        "list its vertices, or remove the region",
+                    )
+                )
 
 
 def _middles(scan: Scan, regions: Mapping[str, Index]) -> dict[str, Point]:

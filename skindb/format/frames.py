@@ -424,9 +424,12 @@ def require_merged(fields: Fields, exposures: Mapping[str, float]) -> None:
     """
     if exposures and [*exposures.values()] != [1.0]:
         finding = ", ".join(f"{seconds:g} s" for seconds in exposures.values())
-        rule = "OpenEXR frames are merged radiance: one exposure of 1 second"
-        cure = "merge them, divide by their seconds, and give one exposure of 1 second"
-        fields.fault("exposures", rule, finding, cure)
+        fields.fault(
+            "exposures",
+            "OpenEXR frames are merged radiance: one exposure of 1 second",
+            finding,
+            "merge them, divide by their seconds, and give one exposure of 1 second",
+        )
 
 
 def require_own_files(
@@ -449,9 +452,12 @@ def require_own_files(
             shared.append((key, f"{Path(name).name} of {' and of '.join(pair)}"))
     if shared:
         key, pair_text = shared[0]
-        rule = "every view must have its own file"
-        cure = "rename the ids, or separate them by folders in the template"
-        fields.fault(key, rule, f"{len(shared)} shared, {pair_text}", cure)
+        fields.fault(
+            key,
+            "every view must have its own file",
+            f"{len(shared)} shared, {pair_text}",
+            "rename the ids, or separate them by folders in the template",
+        )
 
 
 def inside(
@@ -472,8 +478,14 @@ def inside(
     except (OSError, ValueError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         rule = "must be a path that this system can follow"
-        cure = "rename the file, and correct the path"
-        faults.append(Fault(where, rule, f"{short(name)}: {reason}", cure))
+        faults.append(
+            Fault(
+                where,
+                rule,
+                f"{short(name)}: {reason}",
+                "rename the file, and correct the path",
+            )
+        )
         return None
     relative = Path(name)
     if within and not relative.is_absolute() and ".." not in relative.parts:

@@ -115,10 +115,15 @@ def scan_faults(where: str, surface: CleanMesh) -> list[Fault]:
     smallest, largest = SCAN_DIAGONAL
     if smallest <= diagonal <= largest:
         return []
-    rule = f"lengths must be in mm, and a scan must be {smallest:g} to {largest:g} mm across"
-    finding = f"{diagonal:,.{0 if diagonal > largest else 3}f} mm"
     cure = rescaling(likely_unit(diagonal, HEAD_DIAGONAL))
-    return [Fault(where, rule, finding, cure)]
+    return [
+        Fault(
+            where,
+            f"lengths must be in mm, and a scan must be {smallest:g} to {largest:g} mm across",
+            f"{diagonal:,.{0 if diagonal > largest else 3}f} mm",
+            cure,
+        )
+    ]
 
 
 def face_faults(where: str, points: Mapping[str, Float64]) -> list[Fault]:
@@ -133,8 +138,14 @@ def face_faults(where: str, points: Mapping[str, Float64]) -> list[Fault]:
         f"lengths must be in mm, and a face must be {smallest:g} to {largest:g} mm from "
         "brows and eyes to mouth and chin"
     )
-    cure = f"{rescaling(likely_unit(height, FACE_HEIGHT))}, also for the scan"
-    return [Fault(where, rule, f"{height:.3g} mm", cure)]
+    return [
+        Fault(
+            where,
+            rule,
+            f"{height:.3g} mm",
+            f"{rescaling(likely_unit(height, FACE_HEIGHT))}, also for the scan",
+        )
+    ]
 
 
 def face_height(points: Mapping[str, Float64]) -> float | None:
@@ -176,13 +187,18 @@ def discarded_piece_faults(
     distant = [name for name, d in distances.items() if d > LANDMARK_REACH]
     if not distant:
         return []
-    rule = "landmarks must lie on the largest component of the scan, which is kept"
     finding = (
         f"{len(distant)} of {len(points)} up to {max(distances.values()):.0f} mm from "
         f"it, such as {distant[0]}"
     )
-    cure = "remove everything from the scan that does not belong to this face"
-    return [Fault(where, rule, finding, cure)]
+    return [
+        Fault(
+            where,
+            "landmarks must lie on the largest component of the scan, which is kept",
+            finding,
+            "remove everything from the scan that does not belong to this face",
+        )
+    ]
 
 
 def coincidence_faults(where: str, points: Mapping[str, Float64]) -> list[Fault]:
@@ -220,10 +236,14 @@ def order_faults(where: str, points: Mapping[str, Float64]) -> list[Fault]:
     worst, high, low = max(inversions, default=(0.0, "", ""))
     if worst <= MAX_LEVEL_INVERSION:
         return []
-    rule = f"{high} must lie above {low} on a face"
-    finding = f"it {worst * np.sqrt(size):.0f} mm below"
-    cure = "exchange the two points, or mark them again"
-    return [Fault(f"{where}[{high}]", rule, finding, cure)]
+    return [
+        Fault(
+            f"{where}[{high}]",
+            f"{high} must lie above {low} on a face",
+            f"it {worst * np.sqrt(size):.0f} mm below",
+            "exchange the two points, or mark them again",
+        )
+    ]
 
 
 def swapped_faults(
@@ -490,8 +510,14 @@ def device_faults(where: str, dome: DomeRecord, surface: CleanMesh) -> list[Faul
             finding = (
                 f"{len(inner)} of {len(positions)} inside it: {_first_names(inner)}"
             )
-            cure = "calibrate in mm and in the frame of the scan; the centre of a camera is -R^T t"
-            faults.append(Fault(f"{where}[{key}]", rule, finding, cure))
+            faults.append(
+                Fault(
+                    f"{where}[{key}]",
+                    rule,
+                    finding,
+                    "calibrate in mm and in the frame of the scan; a camera is at -R^T t",
+                )
+            )
     return faults
 
 
@@ -530,31 +556,45 @@ def dome_unit_faults(
         # the origin is near the centre of the dome
         distance = float(np.median(np.linalg.norm(positions, axis=1)))
         unit = likely_unit(distance, DOME_RADIUS_RATIO * diagonal)
-        rule = "lengths must be in mm, and a dome must surround the scan"
-        finding = "all of it within the bounding box of the scan"
-        cure = f"{rescaling(unit)}, or calibrate in the frame of the scan"
-        return [Fault(where, rule, finding, cure)]
+        return [
+            Fault(
+                where,
+                "lengths must be in mm, and a dome must surround the scan",
+                "all of it within the bounding box of the scan",
+                f"{rescaling(unit)}, or calibrate in the frame of the scan",
+            )
+        ]
     spans = [picture_span(camera, surface.vertices) for camera in dome.cameras]
     span = max((span for span in spans if span is not None), default=None)
     if span is None:
-        rule = "the picture of a camera must show the scan"
-        finding = f"none of {len(dome.cameras)} does"
-        cure = (
-            "calibrate in mm and in the frame of the scan: x_cam = R x + t, z forwards"
-        )
-        return [Fault(where, rule, finding, cure)]
+        return [
+            Fault(
+                where,
+                "the picture of a camera must show the scan",
+                f"none of {len(dome.cameras)} does",
+                "calibrate in mm and in the frame of the scan: x_cam = R x + t, z forwards",
+            )
+        ]
     if not sized and span < LEAST_SPAN and _shrunken_head(surface, diagonal):
-        rule = (
-            "lengths must be in mm, and a head must span at least a tenth of a picture"
-        )
-        finding = f"{diagonal:.0f} mm across, {span:.1%} of a picture's side"
         cure = rescaling(likely_unit(diagonal, HEAD_DIAGONAL))
-        return [Fault(mesh, rule, finding, cure)]
+        return [
+            Fault(
+                mesh,
+                "lengths must be in mm, and a head must span at least a tenth of a picture",
+                f"{diagonal:.0f} mm across, {span:.1%} of a picture's side",
+                cure,
+            )
+        ]
     if span < (LEAST_SPAN if diagonal > FACE_DIAGONAL else PATCH_SPAN):
-        rule = "lengths must be in mm, and the scan must be visible in the pictures"
-        finding = f"{diagonal:,.0f} mm across, it spans {span:.2%} of a picture's side"
         cure = rescaling(likely_unit(USUAL_SPAN / span, 1.0))
-        return [Fault(where, rule, finding, cure)]
+        return [
+            Fault(
+                where,
+                "lengths must be in mm, and the scan must be visible in the pictures",
+                f"{diagonal:,.0f} mm across, it spans {span:.2%} of a picture's side",
+                cure,
+            )
+        ]
     return []
 
 

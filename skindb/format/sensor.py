@@ -68,8 +68,12 @@ def read_sensor(
             f"must be at most {highest}, the highest value of {bits} bits: no "
             "pixel would be saturated"
         )
-        cure = "bit_depth is that of the file, adc_bits that of the converter"
-        item.fault("white_level", rule, shown(white), cure)
+        item.fault(
+            "white_level",
+            rule,
+            shown(white),
+            "bit_depth is that of the file, adc_bits that of the converter",
+        )
     levels = (black, white) if len(item.faults) == earlier else None
     missing = [key for key in ("read_noise_e", "electrons_per_dn") if not item.has(key)]
     if len(missing) == 1:
@@ -130,9 +134,10 @@ def _response(
     rows, columns = table.shape
     rising = columns == 4 and rows > 1 and bool((np.diff(table, axis=0) > 0).all())
     if not rising or not (np.abs(table) <= MAX_MAGNITUDE).all():
-        finding = f"{name} of {rows} rows and {columns} columns"
         rule = "must be finite columns dn,r,g,b that all rise"
-        item.fault("response", rule, finding, cure)
+        item.fault(
+            "response", rule, f"{name} of {rows} rows and {columns} columns", cure
+        )
         return None, None
     if levels is not None:
         _require_ends(item, name, table, *levels)
@@ -153,11 +158,12 @@ def _require_ends(
     if not covers or (np.abs(ends - [0.0, 1.0]) > RESPONSE_ERROR).any():
         rule = f"must run from 0 at black_level {black:g} to 1 at white_level {white:g}"
         (low, *dimmest), (high, *brightest) = table[0], table[-1]
-        finding = (
-            f"{name}: {min(dimmest):.3g} at {low:g} to {max(brightest):.3g} at {high:g}"
+        item.fault(
+            "response",
+            rule,
+            f"{name}: {min(dimmest):.3g} at {low:g} to {max(brightest):.3g} at {high:g}",
+            "measure it over all values, and divide it by that at the white level",
         )
-        cure = "measure it over all values, and divide it by that at the white level"
-        item.fault("response", rule, finding, cure)
 
 
 def _require_electrons(item: Fields, sensor: SensorRecord) -> None:
@@ -175,6 +181,10 @@ def _require_electrons(item: Fields, sensor: SensorRecord) -> None:
             f"read noise must be at most {MAX_READ_NOISE_FRACTION:g} of the electrons "
             "at the white level"
         )
-        finding = f"{sensor.read_noise:.3g} of {full:.3g} electrons"
         cure = "give it in electrons: values times electrons_per_dn"
-        item.fault("read_noise_e", rule, finding, cure)
+        item.fault(
+            "read_noise_e",
+            rule,
+            f"{sensor.read_noise:.3g} of {full:.3g} electrons",
+            cure,
+        )

@@ -217,9 +217,14 @@ def _require_same(
             json.dumps(record.get(name), sort_keys=True) for record in (before, now)
         )
         if old != new:
-            rule = f"an unfinished capture must be resumed with the same {name}"
-            cure = "give the earlier value, or choose another folder"
-            faults.append(Fault(str(folder), rule, f"{new}, and {old} before", cure))
+            faults.append(
+                Fault(
+                    str(folder),
+                    f"an unfinished capture must be resumed with the same {name}",
+                    f"{new}, and {old} before",
+                    "give the earlier value, or choose another folder",
+                )
+            )
     if faults:
         raise InputError(faults)
 
@@ -344,8 +349,9 @@ def read_setup(folder: Path) -> Setup:
                 )
     if not faults and not isinstance(dome, dict):
         rule = "must contain dome/dome.json"
-        cure = "see docs/howto/capture.md"
-        faults.append(Fault(str(folder), rule, "no such file", cure))
+        faults.append(
+            Fault(str(folder), rule, "no such file", "see docs/howto/capture.md")
+        )
     if faults:
         raise InputError(faults)
     return Setup(folder, dome, probe if isinstance(probe, dict) else None)

@@ -94,17 +94,20 @@ class Dome:
         self.link.request("CLEAR", base=schedule.base)
         for index, step in enumerate(schedule.steps):
             if self.link.clock.monotonic() > deadline:
-                rule = f"must accept {len(schedule.steps)} steps within {seconds:.1f} s"
-                raise self.link.error(rule, f"{index} steps")
+                raise self.link.error(
+                    f"must accept {len(schedule.steps)} steps within {seconds:.1f} s",
+                    f"{index} steps",
+                )
             light = {"light": step.light, "exposure": step.exposure}
             self.link.request(
                 "STEP", index=index, **light, on=step.on_us, off=step.off_us
             )
         if not self.holds(schedule):
             held = self.link.request("PLAN").values
-            text = f"{held.get('steps')} steps, digest {held.get('digest')}"
-            rule = f"must hold {len(schedule.steps)} steps, digest {schedule.digest}"
-            raise self.link.error(rule, text)
+            raise self.link.error(
+                f"must hold {len(schedule.steps)} steps, digest {schedule.digest}",
+                f"{held.get('steps')} steps, digest {held.get('digest')}",
+            )
 
     def holds(self, schedule: Schedule) -> bool:
         """Whether the controller holds exactly these steps."""
@@ -125,8 +128,11 @@ class Dome:
         """
         require_safe(schedule, override)
         if isinstance(override, Rehearsal) and not self.emulated:
-            rule = "must be emulated in a rehearsal, in which nobody confirms that flashes are safe"
-            raise self.link.error(rule, repr(self.name), "omit --virtual")
+            raise self.link.error(
+                "must be emulated in a rehearsal, in which nobody confirms that flashes are safe",
+                repr(self.name),
+                "omit --virtual",
+            )
         operator = {} if override is None else {"operator": override.operator}
         self.link.request("ARM", digest=schedule.digest, **operator)
 
@@ -201,9 +207,10 @@ class Dome:
             text = error.faults[0].found
         if state in ("", "running"):
             self.link.clock.sleep(SILENCE_SECONDS)
-            rule = "must confirm that it stopped"
             raise self.link.error(
-                rule, f"{text}, so that lights may be on", LIGHTS_CURE
+                "must confirm that it stopped",
+                f"{text}, so that lights may be on",
+                LIGHTS_CURE,
             )
 
     def report_step(self, schedule: Schedule, index: int) -> Measured:
@@ -243,19 +250,26 @@ class Dome:
         state = self.state(len(schedule.steps))
         now = self.link.clock.monotonic()
         if state.state not in ("running", "done", "stopped"):
-            rule = "must be running, done or stopped after START"
-            raise self.link.error(rule, state.state, FIRMWARE_CURE)
+            raise self.link.error(
+                "must be running, done or stopped after START",
+                state.state,
+                FIRMWARE_CURE,
+            )
         if state.state == "running" and state.interlock == "open":
             raise self.link.error(
                 "must stop when the interlock is open", "running", FIRMWARE_CURE
             )
         if state.state == "done" and state.step < len(schedule.steps):
-            rule = f"must finish {len(schedule.steps)} steps before it is done"
-            raise self.link.error(rule, f"{state.step} steps", FIRMWARE_CURE)
-        if state.step < before.step:
-            rule = "must not count fewer finished steps than before"
             raise self.link.error(
-                rule, f"{state.step} after {before.step}", FIRMWARE_CURE
+                f"must finish {len(schedule.steps)} steps before it is done",
+                f"{state.step} steps",
+                FIRMWARE_CURE,
+            )
+        if state.step < before.step:
+            raise self.link.error(
+                "must not count fewer finished steps than before",
+                f"{state.step} after {before.step}",
+                FIRMWARE_CURE,
             )
         at_least = sent - start.replied
         at_most = now - start.requested
@@ -274,11 +288,16 @@ class Dome:
         )
         latest = step.off_us / 1e6 * (1 + CLOCK_ERROR) + SLACK_SECONDS
         if state.state == "running" and at_least > latest:
-            rule = f"must finish step {state.step} within {latest:.1f} s"
-            raise self.link.error(rule, f"no progress after {at_least:.1f} s")
+            raise self.link.error(
+                f"must finish step {state.step} within {latest:.1f} s",
+                f"no progress after {at_least:.1f} s",
+            )
         if state.step > 0:
             planned = schedule.steps[state.step - 1].off_us / 1e6
             earliest = planned * (1 - CLOCK_ERROR) - EARLY_SECONDS
             if at_most < earliest:
-                rule = f"cannot finish {state.step} steps in less than {earliest:.1f} s"
-                raise self.link.error(rule, f"{at_most:.1f} s", FIRMWARE_CURE)
+                raise self.link.error(
+                    f"cannot finish {state.step} steps in less than {earliest:.1f} s",
+                    f"{at_most:.1f} s",
+                    FIRMWARE_CURE,
+                )

@@ -333,9 +333,10 @@ class Link:
         try:
             return accepted.parse(text)
         except ValueError:
-            received = f"{text!r} in {message.kind}{message.number}"
             raise self.error(
-                f"must send as {name} {accepted}", received, FIRMWARE_CURE
+                f"must send as {name} {accepted}",
+                f"{text!r} in {message.kind}{message.number}",
+                FIRMWARE_CURE,
             ) from None
 
     def hello(self, kind: str) -> Message:
@@ -348,9 +349,8 @@ class Link:
             reply.values.get("protocol", "?"),
         )
         if greeting != (kind, str(PROTOCOL)):
-            rule = f"must be a {kind} with protocol {PROTOCOL}"
             raise self.error(
-                rule,
+                f"must be a {kind} with protocol {PROTOCOL}",
                 f"{greeting[0]} with protocol {greeting[1]}",
                 "check which device has which address",
             )
@@ -502,10 +502,13 @@ def open_port(url: str) -> Port:
         serial.SerialException,
     ) as error:
         # pyserial parses its URLs without checks and does not catch the errors of parsing
-        rule = "a device must be at this address"
-        cure = "give an address like /dev/ttyACM0 or socket://127.0.0.1:7000"
         raise DeviceError(
-            Fault(f"address {url}", rule, _system_reason(error), cure)
+            Fault(
+                f"address {url}",
+                "a device must be at this address",
+                _system_reason(error),
+                "give an address like /dev/ttyACM0 or socket://127.0.0.1:7000",
+            )
         ) from None
     return port
 
@@ -584,10 +587,13 @@ class ReplayPort:
             self._left.pop(0)
         recorded = self._left.pop(0)[2] if self._left else b"nothing more"
         if recorded != data:
-            rule = f"the next request of a replay must be {recorded!r}"
-            finding = f"{data!r}"
             raise DeviceError(
-                Fault(str(self.path), rule, finding, "replay it with the same commands")
+                Fault(
+                    str(self.path),
+                    f"the next request of a replay must be {recorded!r}",
+                    f"{data!r}",
+                    "replay it with the same commands",
+                )
             )
 
     def close(self) -> None:

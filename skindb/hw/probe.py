@@ -113,12 +113,15 @@ class Gauge:
             t = self._link.value(event, "t", GAUGE_SECONDS)
             kpa = self._link.value(event, "kpa", GAUGE_KPA)
             if not previous < t <= seconds + MAX_AHEAD_SECONDS:
-                rule = "must send readings of the gauge in order, with their times since PUMP"
                 received = (
                     f"{t:.2f} s, {seconds:.2f} s after PUMP and after a reading of "
                     f"{previous:.2f} s"
                 )
-                raise self._link.error(rule, received, FIRMWARE_CURE)
+                raise self._link.error(
+                    "must send readings of the gauge in order, with their times since PUMP",
+                    received,
+                    FIRMWARE_CURE,
+                )
             self._require_recent(t - max(previous, 0.0))
             self.readings.append((t, kpa))
             previous = t
@@ -128,27 +131,33 @@ class Gauge:
     def _require_recent(self, age: float) -> None:
         """Refuse a pressure that was unknown for too long, also if another reading followed."""
         if not age <= MAX_AGE_SECONDS + TIME_PRECISION_SECONDS:
-            rule = f"must have a reading of the gauge in the last {MAX_AGE_SECONDS} s"
             finding = (
                 f"none for {age:.2f} s" if self.readings else f"none in {age:.2f} s"
             )
-            raise self._link.error(rule, finding, "check the gauge and its cable")
+            raise self._link.error(
+                f"must have a reading of the gauge in the last {MAX_AGE_SECONDS} s",
+                finding,
+                "check the gauge and its cable",
+            )
 
     def _require_pressure(self, t: float, kpa: float) -> None:
         """Refuse suction stronger than wanted, overpressure, which lifts the probe, and leaks."""
         lowest = self._target - PRESSURE_TOLERANCE_KPA
         if not lowest <= kpa <= PRESSURE_TOLERANCE_KPA:
-            rule = f"must hold a pressure from {lowest:g} to {PRESSURE_TOLERANCE_KPA:g} kPa"
             raise self._link.error(
-                rule, f"{kpa:.2f} kPa", "check the pump and the gauge"
+                f"must hold a pressure from {lowest:g} to {PRESSURE_TOLERANCE_KPA:g} kPa",
+                f"{kpa:.2f} kPa",
+                "check the pump and the gauge",
             )
         if self.settled and not kpa <= self._target + PRESSURE_TOLERANCE_KPA:
-            rule = (
-                f"must hold {self._target:g} kPa within {PRESSURE_TOLERANCE_KPA:g} kPa"
+            raise PlacementError(
+                Fault(
+                    self._link.name,
+                    f"must hold {self._target:g} kPa within {PRESSURE_TOLERANCE_KPA:g} kPa",
+                    f"{kpa:.2f} kPa after {t:.1f} s, so it leaks",
+                    "press it on, check its seal, and place it again",
+                )
             )
-            received = f"{kpa:.2f} kPa after {t:.1f} s, so it leaks"
-            cure = "press it on, check its seal, and place it again"
-            raise PlacementError(Fault(self._link.name, rule, received, cure))
 
 
 class Probe:
@@ -235,9 +244,10 @@ class Probe:
             text = error.faults[0].found
         if text:
             self.link.clock.sleep(SILENCE_SECONDS)
-            cure = "take the probe off, and switch off its power"
             raise self.link.error(
-                "must confirm that it released the suction", text, cure
+                "must confirm that it released the suction",
+                text,
+                "take the probe off, and switch off its power",
             )
 
     def _settle(self, gauge: Gauge, pressure: float) -> None:
@@ -270,11 +280,16 @@ class Probe:
             if state == "idle":
                 break
             if elapsed > seconds + SLACK_SECONDS:
-                rule = f"must expose {name} within {seconds + SLACK_SECONDS:.1f} s"
-                raise self.link.error(rule, f"still exposing after {elapsed:.1f} s")
+                raise self.link.error(
+                    f"must expose {name} within {seconds + SLACK_SECONDS:.1f} s",
+                    f"still exposing after {elapsed:.1f} s",
+                )
             clock.sleep(min(POLL_SECONDS, seconds))
         if elapsed < seconds * (1 - CLOCK_ERROR) - EARLY_SECONDS:
-            rule = f"must expose {name} for {seconds:.3f} s"
-            raise self.link.error(rule, f"{elapsed:.3f} s", FIRMWARE_CURE)
+            raise self.link.error(
+                f"must expose {name} for {seconds:.3f} s",
+                f"{elapsed:.3f} s",
+                FIRMWARE_CURE,
+            )
         gauge.check()
         return triggers

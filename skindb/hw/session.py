@@ -436,10 +436,13 @@ def capture_site(
     [(name, shots)] = camera.collect(len(exposures), FRAME_SECONDS).items()
     triggers = sum(placement.triggers.values())
     if not len(shots) == triggers == len(exposures):
-        rule = "must take a frame of every exposure"
-        text = f"{len(shots)} frames for {triggers} triggers and {len(exposures)} exposures"
         raise PlacementError(
-            Fault(f"camera {name}", rule, text, f"measure {site} again")
+            Fault(
+                f"camera {name}",
+                "must take a frame of every exposure",
+                f"{len(shots)} frames for {triggers} triggers and {len(exposures)} exposures",
+                f"measure {site} again",
+            )
         )
     paths = (shot.path for shot in shots)
     return SiteRun(site, placement, dict(zip(exposures, paths, strict=True)))

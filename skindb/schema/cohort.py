@@ -294,9 +294,14 @@ def require_same_fit(cohort: xr.Dataset) -> None:
             differences = "; ".join(
                 f"{value} of {few_names(takes)}" for value, takes in groups.items()
             )
-            rule = "the takes of a study are fitted with the same parameters"
-            cure = "refit them alike, or name the takes that the study is to use"
-            faults.append(Fault(f"parameter {name}", rule, differences, cure))
+            faults.append(
+                Fault(
+                    f"parameter {name}",
+                    "the takes of a study are fitted with the same parameters",
+                    differences,
+                    "refit them alike, or name the takes that the study is to use",
+                )
+            )
     if faults:
         raise InputError(faults)
 

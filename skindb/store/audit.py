@@ -287,10 +287,9 @@ def _chain_faults(
             and before is not None
             and entry.previous not in ("", before.seal)
         ):
-            rule = f"entry {number} must follow the entry before it"
             yield Fault(
                 place.where(entry_key(number)),
-                rule,
+                f"entry {number} must follow the entry before it",
                 "an entry that names a different predecessor",
                 RESTORE,
             )

@@ -154,9 +154,10 @@ class _Evaluation:
         """Values of a column of truth values."""
         values = self.values(node)
         if _kinds(values) - {TRUTH}:
-            finding = f"{self.column(node.id)} alone"
             raise self.fault(
-                "must compare a column of text or numbers", finding, EXAMPLE
+                "must compare a column of text or numbers",
+                f"{self.column(node.id)} alone",
+                EXAMPLE,
             )
         return [None if is_missing(value) else bool(value) for value in values]
 
@@ -181,8 +182,11 @@ class _Evaluation:
             name.lower(), [*self.columns, "True", "False"], n=1
         )
         hint = f"did you mean {near[0]}? " if near else ""
-        cure = f"{hint}Text needs quotes; columns: {', '.join(self.columns)}"
-        raise self.fault("must name columns of the catalogue", f"the name {text}", cure)
+        raise self.fault(
+            "must name columns of the catalogue",
+            f"the name {text}",
+            f"{hint}Text needs quotes; columns: {', '.join(self.columns)}",
+        )
 
     def literal(self, node: ast.expr) -> Any:
         """The text, number or truth value of a literal."""
@@ -193,9 +197,10 @@ class _Evaluation:
         if isinstance(node, ast.Constant) and isinstance(node.value, str | int | float):
             return node.value
         if isinstance(node, ast.Constant) and node.value is None:
-            cure = "write, for example: age is missing"
             raise self.fault(
-                "must write 'is missing' for a missing value", "None", cure
+                "must write 'is missing' for a missing value",
+                "None",
+                "write, for example: age is missing",
             )
         raise self.refused(node)
 
@@ -230,11 +235,10 @@ class _Evaluation:
             ]
         texts = self.values(right)
         if not _kinds(values) | _kinds(texts) <= {TEXT}:
-            cure = "write, for example: condition in ['lotion', 'normal']"
             raise self.fault(
                 "must have a list or a text after 'in', and a text before a text",
                 "other values",
-                cure,
+                "write, for example: condition in ['lotion', 'normal']",
             )
         return [
             None if is_missing(a) or is_missing(b) else a in b
@@ -246,12 +250,10 @@ class _Evaluation:
     ) -> None:
         """Refuse a comparison of two kinds of values; a column of several kinds has no order."""
         if (order and len(left | right) > 1) or (left and right and not left & right):
-            finding = (
-                f"{' and '.join(sorted(left))} beside {' and '.join(sorted(right))}"
-            )
-            cure = "put text in quotes, and write numbers without them"
             raise self.fault(
-                "must compare text with text and numbers with numbers", finding, cure
+                "must compare text with text and numbers with numbers",
+                f"{' and '.join(sorted(left))} beside {' and '.join(sorted(right))}",
+                "put text in quotes, and write numbers without them",
             )
 
     def dates(self, values: Column) -> Column:

@@ -18,9 +18,13 @@ def record_consent(place: Place, subject: str, scope: Iterable[str]) -> Record:
     """See `Database.record_consent`."""
     scopes = list(dict.fromkeys(scope))
     if unknown := [name for name in scopes if name not in SCOPES]:
-        rule = f"a scope must be one of {', '.join(SCOPES)}"
         finding = ", ".join(map(repr, unknown))
-        raise input_error("scope", rule, finding, "choose from these")
+        raise input_error(
+            "scope",
+            f"a scope must be one of {', '.join(SCOPES)}",
+            finding,
+            "choose from these",
+        )
     _require_subject(place, subject)
     with Stage(place, CONSENT, subject) as stage:
         record = stage.commit({"subject": subject, "consent_scope": scopes})

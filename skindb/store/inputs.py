@@ -89,13 +89,15 @@ def require_own_subject(kind: str, take: str, names: Iterable[str]) -> None:
     """
     foreign = sorted(name for name in names if subject_of(name) != subject_of(take))
     if kind in KINDS_OF_ONE_SUBJECT and foreign:
-        rule = f"a {kind} must refer to takes of its own subject only"
         cure = (
             "commit what many subjects share as a kind of its own, and name that "
             "version as the input"
         )
         raise input_error(
-            f"{kind} of {take}", rule, f"a reference to {', '.join(foreign)}", cure
+            f"{kind} of {take}",
+            f"a {kind} must refer to takes of its own subject only",
+            f"a reference to {', '.join(foreign)}",
+            cure,
         )
 
 
@@ -119,11 +121,14 @@ def require_consents(
         if not log.is_empty() and scope not in consent_scope(
             (record := log.read()).provenance
         ):
-            rule = f"its subject must consent to {scope} when it is committed"
-            finding = f"no such consent since {record.created}"
             title = f"{kind} of {take}" if kind != STUDY else f"study {take}, {subject}"
             faults.append(
-                Fault(title, rule, finding, "nothing was committed; see skindb consent")
+                Fault(
+                    title,
+                    f"its subject must consent to {scope} when it is committed",
+                    f"no such consent since {record.created}",
+                    "nothing was committed; see skindb consent",
+                )
             )
     if faults:
         raise InputError(faults)

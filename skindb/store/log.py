@@ -156,12 +156,11 @@ class Log:
                 self.remove(record.generation)
             raise
         if not created:
-            finding = f"generation {record.generation} was committed by another writer"
             raise Conflict(
                 Fault(
                     self.what,
                     "a generation must be committed only once",
-                    finding,
+                    f"generation {record.generation} was committed by another writer",
                     "run the command again",
                 )
             )
@@ -280,11 +279,10 @@ class Log:
                 )
             ]
         if seal not in ("?", before):
-            rule = f"generation {record.generation} must follow the record before it"
             return [
                 Fault(
                     self.what,
-                    rule,
+                    f"generation {record.generation} must follow the record before it",
                     "a record that names a different predecessor",
                     RESTORE,
                 )
@@ -319,8 +317,12 @@ class Log:
             return None
         if self.is_removed(head["seal"]):
             return None
-        rule = f"generation {record.generation} must be the record that was committed"
-        return Fault(self.what, rule, "a different record", self._head_cure())
+        return Fault(
+            self.what,
+            f"generation {record.generation} must be the record that was committed",
+            "a different record",
+            self._head_cure(),
+        )
 
     def _head_cure(self) -> str:
         return f"{RESTORE}; if the log is correct, remove {self.head_key}"

@@ -92,12 +92,11 @@ def inside(root: Path, key: str) -> Path:
 
 
 def _outside_fault(root: Path | str, key: str, finding: str) -> Fault:
-    cure = "restore the file that names this path from a backup"
     return Fault(
         f"{root}: {key[:200]!r}",
         "every path must stay inside the database",
         finding,
-        cure,
+        "restore the file that names this path from a backup",
     )
 
 

@@ -213,14 +213,17 @@ def _require_empty(place: Place) -> None:
     names = place.names() or []
     foreign = [name for name in names if name not in (STAGING, WITHDRAWN)]
     if foreign or place.sizes(WITHDRAWN):
-        rule = "a restore needs an empty or missing folder"
-        cure = "give another folder; nothing was changed"
         finding = (
             "a database or a backup"
             if {"log", WITHDRAWN} & {*names}
             else f"other files, such as {foreign[0]}"
         )
-        raise input_error(place.name, rule, finding, cure)
+        raise input_error(
+            place.name,
+            "a restore needs an empty or missing folder",
+            finding,
+            "give another folder; nothing was changed",
+        )
 
 
 def _copy_all(archive: Archive, place: Place, plan: Plan) -> int:

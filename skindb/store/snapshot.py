@@ -128,9 +128,14 @@ class Snapshot:
             return record
         if self.markers.hides(kind, take):
             raise self._missing_error(kind, take)
-        rule = "a version must not refer to a withdrawn subject"
-        finding = "a withdrawal that is not complete"
-        raise WithdrawnError(Fault(record.title, rule, finding, "run skindb refresh"))
+        raise WithdrawnError(
+            Fault(
+                record.title,
+                "a version must not refer to a withdrawn subject",
+                "a withdrawal that is not complete",
+                "run skindb refresh",
+            )
+        )
 
     def history(self, kind: str, take: str) -> list[Record]:
         """All records, oldest first; see `Database.history`."""
@@ -164,9 +169,13 @@ class Snapshot:
         finding = f"takes: {', '.join(takes)}"
         if not takes:
             finding = f"no {kind}; kinds: {', '.join(self.kinds()) or 'none'}"
-        title = f"{self.place.name}: {kind} of {take}"
         return InputError(
-            Fault(title, "the database must hold it", finding, "see skindb info")
+            Fault(
+                f"{self.place.name}: {kind} of {take}",
+                "the database must hold it",
+                finding,
+                "see skindb info",
+            )
         )
 
 
@@ -457,11 +466,10 @@ class RecordCache:
     def _require_same_markers(self) -> None:
         """Raise a `WithdrawnError` if a subject was withdrawn since this query began."""
         if read_markers(self.place) != self._markers:
-            rule = "no subject must be withdrawn while the cache is written"
             raise WithdrawnError(
                 Fault(
                     self.place.where(CATALOGUE),
-                    rule,
+                    "no subject must be withdrawn while the cache is written",
                     "a withdrawal",
                     "run the command again",
                 )

@@ -130,9 +130,13 @@ def _layout_faults(
     for name in place.children(key, links=True):
         child = f"{key}/{name}"
         if not re.fullmatch(levels[0], name):
-            rule = "a database must contain only files of skindb"
             faults.append(
-                Fault(place.where(child), rule, "an unknown name", "remove it")
+                Fault(
+                    place.where(child),
+                    "a database must contain only files of skindb",
+                    "an unknown name",
+                    "remove it",
+                )
             )
         elif len(levels) > 1:
             faults += _layout_faults(place, child, levels[1:], beside)
@@ -169,9 +173,13 @@ def _input_faults(
                 continue
             if seals.get((log.kind, log.take, generation)) != reference["seal"]:
                 by = record.title
-                rule = f"generation {generation}, from which {by} was made, must exist"
                 faults.append(
-                    Fault(log.what, rule, "no record, or a different one", RESTORE)
+                    Fault(
+                        log.what,
+                        f"generation {generation}, from which {by} was made, must exist",
+                        "no record, or a different one",
+                        RESTORE,
+                    )
                 )
     return faults
 

@@ -194,10 +194,13 @@ def _require_admitted(db: Database, take: str, scratch: Path) -> None:
     entry = db.withdrawal(subject_of(take))
     if entry is not None and entry.is_withdrawal:
         shutil.rmtree(scratch, ignore_errors=True)
-        rule = "a withdrawn subject must consent again before a capture is ingested"
-        cure = "if there is a new consent, state its date with --new-consent"
         raise WithdrawnError(
-            Fault(subject_of(take), rule, f"a withdrawal on {entry.date}", cure)
+            Fault(
+                subject_of(take),
+                "a withdrawn subject must consent again before a capture is ingested",
+                f"a withdrawal on {entry.date}",
+                "if there is a new consent, state its date with --new-consent",
+            )
         )
 
 

@@ -346,8 +346,9 @@ def takes_with_landmarks(db: Database, takes: Sequence[str] | None = None) -> li
 
 def require_fitted(db: Database, takes: Sequence[str]) -> None:
     """Refuse a study without takes."""
-    rule = "a study needs fitted takes"
-    require(takes, db.url, rule, "no model", "run skindb fit first")
+    require(
+        takes, db.url, "a study needs fitted takes", "no model", "run skindb fit first"
+    )
 
 
 def current_registrations(db: Database, takes: Sequence[str]) -> dict[str, Record]:

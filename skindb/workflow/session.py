@@ -164,13 +164,17 @@ def _require_parameters(parameters: SessionParameters, needed: Iterable[str]) ->
     )
     for site in _names(parameters.sites):
         if not re.fullmatch(IDENTIFIER.pattern, site):
-            rule = f"a name {IDENTIFIER.text}"
-            faults.append(Fault("--sites", rule, repr(site), "correct it"))
+            faults.append(
+                Fault("--sites", f"a name {IDENTIFIER.text}", repr(site), "correct it")
+            )
             break
     for key, path in _given_files(parameters).items():
         if not path.is_file():
-            cure = "correct the path"
-            faults.append(Fault(f"--{FILES[key]}", "must be a file", str(path), cure))
+            faults.append(
+                Fault(
+                    f"--{FILES[key]}", "must be a file", str(path), "correct the path"
+                )
+            )
     faults += _subject_faults(parameters) + _operator_faults(parameters)
     if faults:
         raise InputError(faults)
@@ -185,8 +189,14 @@ def _rehearsal_faults(parameters: SessionParameters) -> list[Fault]:
         if getattr(parameters, name) is not None
     ]
     if parameters.seed is not None and parameters.setup is not None:
-        rule = "makes a virtual subject, which a capture given by --setup replaces"
-        faults.append(Fault("--seed", rule, "--setup", cure))
+        faults.append(
+            Fault(
+                "--seed",
+                "makes a virtual subject, which a capture given by --setup replaces",
+                "--setup",
+                cure,
+            )
+        )
     return faults
 
 
@@ -199,10 +209,16 @@ def _real_session_faults(
         for name, value in (("fault", parameters.faults), ("seed", parameters.seed))
         if value not in ((), None)
     ]
-    for name in needed:
-        if getattr(parameters, name) in (None, ""):
-            cure = f"give it, or rehearse with --virtual, which needs no --{name}"
-            faults.append(Fault(f"--{name}", "a capture needs it", "nothing", cure))
+    faults += [
+        Fault(
+            f"--{name}",
+            "a capture needs it",
+            "nothing",
+            f"give it, or rehearse with --virtual, which needs no --{name}",
+        )
+        for name in needed
+        if getattr(parameters, name) in (None, "")
+    ]
     return faults
 
 
@@ -250,8 +266,14 @@ def _operator_faults(parameters: SessionParameters) -> list[Fault]:
         return [Fault("--operator", IDENTIFIER.text, repr(operator), "correct it")]
     if operator is None and (confirmed or real_lamp):
         option = "--confirm-screening" if confirmed else "--base-light"
-        rule = "an operator must be responsible for it"
-        return [Fault(option, rule, "no --operator", "add --operator ID")]
+        return [
+            Fault(
+                option,
+                "an operator must be responsible for it",
+                "no --operator",
+                "add --operator ID",
+            )
+        ]
     return []
 
 

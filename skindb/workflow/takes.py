@@ -71,12 +71,18 @@ class KilledError(InputError):
     """The process of a take was killed, perhaps by a take beside it."""
 
     def __init__(self, take: Any) -> None:
-        rule = "the process of a take must run to its end"
         cure = (
             "a lack of memory is the usual reason: close other programs, or use fewer "
             "workers"
         )
-        super().__init__(Fault(str(take), rule, "it was killed", cure))
+        super().__init__(
+            Fault(
+                str(take),
+                "the process of a take must run to its end",
+                "it was killed",
+                cure,
+            )
+        )
 
 
 @dataclass(frozen=True)
