@@ -98,7 +98,7 @@ def albedo_histograms(
     """
     if not mixed_fits:
         require_same_fit(cohort)
-    takes = [str(take) for take in cohort["take"].values]
+    takes = cohort["take"].values.tolist()
     loaded = each_take(xr.Dataset.load, cohort, COLOUR_VARIABLES)
     drawn = None if drawn is None else drawn.load()
     samples = [_colours(sample, drawn) for sample in loaded]
@@ -248,7 +248,7 @@ def albedo_table(
     takes, people = takes_to_compare(cohort, group_by)
     groups = groups_by(people, group_by)
     names = sorted(set(groups))
-    labels = [str(take) for take in takes["take"].values]
+    labels = takes["take"].values.tolist()
     members = [
         [take for take, group in zip(labels, groups, strict=True) if group == name]
         for name in names
@@ -354,7 +354,7 @@ def plot_albedo(
         lines = part[variables.GROUP_HISTOGRAM].isel(axis=axis).values
     else:
         part = histograms.sel(region=region)
-        names = [str(take) for take in part["take"].values]
+        names = part["take"].values.tolist()
         lines = part[variables.ALBEDO_HISTOGRAM].isel(axis=axis).values
     ax.set_prop_cycle(color=plots.CYCLE)
     for i, (name, fractions) in enumerate(zip(names, lines, strict=True)):

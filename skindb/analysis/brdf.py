@@ -123,7 +123,7 @@ def population_basis(
     if not mixed_fits:
         require_same_fit(cohort)
     names = same_dictionary(cohort)
-    takes = [str(take) for take in cohort["take"].values]
+    takes = cohort["take"].values.tolist()
     X = _start_weights(cohort, takes, rng)
     [metric] = each_item(brdf_metric, [tables])
     start = nmf(

@@ -91,7 +91,7 @@ def plot_group_spheres(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     ax
         Axes to draw on; by default new ones.
     """
-    names = [str(name) for name in space["group"].values]
+    names = space["group"].values.tolist()
     columns = min(len(names), SPHERES_PER_ROW)
     rows = -(-len(names) // columns)
     ax = ax or plots.new_axes(1.6 * columns + 0.4, 1.9 * rows + 0.4)

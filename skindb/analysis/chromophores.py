@@ -304,7 +304,7 @@ def chromophore_statistics(
             variables.TAKE_CHROMOPHORE_COVERAGE: covered,
         },
         coords={
-            "take": [str(take) for take in cohort["take"].values],
+            "take": cohort["take"].values.tolist(),
             "region": list(drawn),
             "chromophore": list(CHROMOPHORES),
         },
@@ -338,7 +338,7 @@ def chromophore_table(
     names = sorted(set(groups))
     values = (
         statistics[variables.TAKE_CHROMOPHORE]
-        .sel(take=[str(take) for take in takes["take"].values])
+        .sel(take=takes["take"].values.tolist())
         .values
     )
     parts = []
@@ -593,7 +593,7 @@ def plot_chromophores(
     ax.axvline(0, color="0.6", linewidth=1)
     if table is None:
         raise ValueError("table must be given; pass the result of chromophore_table")
-    groups = [str(name) for name in table["group"].values]
+    groups = table["group"].values.tolist()
     colours = dict(zip(CHROMOPHORES, (plots.BLUE, plots.RED), strict=True))
     lines = list(itertools.product(enumerate(groups), colours))
     for i, ((g, group), name) in enumerate(lines):

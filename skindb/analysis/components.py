@@ -318,7 +318,7 @@ def face_components(
             variables.PRINCIPAL_RESIDUAL: components["residual"].values,
         },
         coords={
-            "take": [str(take) for take in components["take"].values],
+            "take": components["take"].values.tolist(),
             "channel": ["R", "G", "B"],
         },
         attrs={

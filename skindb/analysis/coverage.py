@@ -92,7 +92,7 @@ def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
     factors = _factors(cohort, takes, stated)
     levels = {name: _values(name, factor) for name, factor in factors.items()}
     if SITE in factors:  # including sites without measurements
-        levels[SITE] = [str(site) for site in cohort["site"].values]
+        levels[SITE] = cohort["site"].values.tolist()
     counts = dict(_cells(factors, levels))
     names = [
         name
@@ -164,7 +164,7 @@ def _factors(
         )
         measured = np.any(good.reshape(*good.shape[:2], -1), axis=-1)
         measured = np.asarray(measured & takes.is_normal[:, None])
-        sites = [str(site) for site in cohort["site"].values]
+        sites = cohort["site"].values.tolist()
         factors[SITE] = [
             frozenset(
                 itertools.compress(

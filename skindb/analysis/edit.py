@@ -163,7 +163,7 @@ def _trait_amounts(amounts: Mapping[str, float], traits: xr.Dataset) -> Array:
     """Amounts (trait,); raises `InputError` for unknown traits and for amounts that are
     not finite or too large.
     """
-    names = [str(t) for t in traits["trait"].values]
+    names = traits["trait"].values.tolist()
     total = np.zeros(len(names))
     faults = list[Fault]()
     for name, amount in amounts.items():
@@ -209,7 +209,7 @@ def _moved_surface(
         (step < 0) & (mean > 0), target / np.where(mean > 0, mean, 1.0), 1.0
     )
     moved[good] = here * weaker + np.maximum(step, 0.0)
-    takes = [str(t) for t in basis["take"].values]
+    takes = basis["take"].values.tolist()
     gram = H @ metric @ H.T
     distance, move = _distances(
         target, mean, basis[variables.TAKE_COEFFICIENT].values, takes, gram
@@ -329,7 +329,7 @@ def _moved_texture(
         "distance_before": edit.distance_before,
     }
     # requested change of the mean of the whole face, like the other values of the report
-    region = [str(name) for name in texture["region"].values].index(FACE)
+    region = texture["region"].values.tolist().index(FACE)
     step = (
         np.nan_to_num(shift[region, :, 0]).mean(axis=-1)
         @ np.linalg.inv(texture[variables.TEXTURE_COLOUR_AXIS].values).T
@@ -365,12 +365,12 @@ def _with_albedo(
     good = np.isfinite(colour).all(axis=1)
     area = fitted[variables.SURFEL_AREA].values[good].astype(float)
     before, now = (np.average(x[good], axis=0, weights=area) for x in (colour, out))
-    face = [str(r) for r in albedo["region"].values].index(FACE)
+    face = albedo["region"].values.tolist().index(FACE)
     takes = albedo[variables.ALBEDO_MEAN].values[:, face]
     axes = albedo[variables.COLOUR_AXIS].values
     # on the decorrelated axes, the unit is the standard deviation of skin in that direction
     distance, move = _distances(
-        now, before, takes, [str(t) for t in albedo["take"].values], axes.T @ axes
+        now, before, takes, albedo["take"].values.tolist(), axes.T @ axes
     )
     cut = (np.clip(target, DARKEST, BRIGHTEST) != target)[good] & (target != colour)[
         good
@@ -396,7 +396,7 @@ def _moved_albedo(
     area = fitted[variables.SURFEL_AREA].values[good].astype(float)
     values = decorrelate(colour[good], mean, axes)
     here = histogram(np.clip(values, edges[:, 0], edges[:, -1]), area, edges)
-    face = [str(r) for r in albedo["region"].values].index(FACE)
+    face = albedo["region"].values.tolist().index(FACE)
     source = quantiles(here, edges)
     shifted = source + shift[face]
     target = valid_quantiles(shifted)

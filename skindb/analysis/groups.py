@@ -344,11 +344,11 @@ def plot_group_effects(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot effects with their 95 % intervals in standard deviations between subjects,
     one row per quantity.
     """
-    names = [str(name) for name in table["quantity"].values]
+    names = table["quantity"].values.tolist()
     ax = ax or plots.new_axes(6.5, 1.2 + 0.22 * len(names))
     ax.axvline(0, color="0.6", linewidth=1)
     places = np.arange(len(names))[::-1]
-    contrasts = [str(name) for name in table["contrast"].values]
+    contrasts = table["contrast"].values.tolist()
     for i, contrast in enumerate(contrasts):
         part = table.sel(contrast=contrast)
         effect, low, high, standardised = (

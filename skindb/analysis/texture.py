@@ -133,7 +133,7 @@ def texture_statistics(
             variables.TEXTURE_REGION: drawn,
         },
         coords={
-            "take": [str(take) for take in cohort["take"].values],
+            "take": cohort["take"].values.tolist(),
             "region": names,
             "part": part_names(),
             "channel": ["R", "G", "B"],
@@ -325,7 +325,7 @@ def edit_texture(
     rng
         Random generator of the noise.
     """
-    names = [str(name) for name in texture["region"].values]
+    names = texture["region"].values.tolist()
     mean = texture[variables.TEXTURE_COLOUR_MEAN].values
     axes = texture[variables.TEXTURE_COLOUR_AXIS].values
     drawn = texture[variables.TEXTURE_REGION].values.astype(np.float32)

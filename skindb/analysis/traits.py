@@ -149,7 +149,7 @@ def trait_vectors(
             **_shifts(list(units.values()), values, rng),
         },
         coords={
-            "take": [str(take) for take in cohort["take"].values],
+            "take": cohort["take"].values.tolist(),
             "trait": list(units),
             "side": list(SIDES),
             "region": albedo["region"].values,
@@ -412,9 +412,7 @@ def _texture_quantiles(texture: xr.Dataset, takes: Array, regions: Array) -> Arr
     `texture` has none.
     """
     values = texture[variables.TEXTURE_QUANTILE].values
-    rows, columns = (
-        [str(label) for label in texture[dim].values] for dim in ("take", "region")
-    )
+    rows, columns = (texture[dim].values.tolist() for dim in ("take", "region"))
     out = np.full((len(takes), len(regions), *values.shape[2:]), np.nan, np.float32)
     for t, take in enumerate(map(str, takes)):
         for r, region in enumerate(map(str, regions)):

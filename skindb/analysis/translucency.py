@@ -91,7 +91,7 @@ def translucency_table(
     groups = groups_by(people, group_by)
     names = sorted(set(groups))
     members = [np.flatnonzero([group == name for group in groups]) for name in names]
-    sites = [str(site) for site in takes["site"].values] if PROBED in takes else []
+    sites = takes["site"].values.tolist() if PROBED in takes else []
     measured = _trusted(takes)
     empty = np.full((takes.sizes["take"], len(sites), 3), np.nan)
 
@@ -236,7 +236,7 @@ def plot_translucency(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     are groups.
     """
     ax = ax or plots.new_axes(6, 3.6)
-    sites = [str(s) for s in table["site"].values]
+    sites = table["site"].values.tolist()
     for g, group in enumerate(map(str, table["group"].values)):
         for c, colour in enumerate(plots.CHANNELS):
             part = table.isel(group=g, channel=c)

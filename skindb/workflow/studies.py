@@ -183,7 +183,7 @@ def _brdf_tables(
     )
     disc = float(opened[variables.DISC_ANGULAR_RADIUS][0])
     require_mixture(cohort.coords, "cohort")
-    names = [str(name) for name in cohort["dictionary"].values]
+    names = cohort["dictionary"].values.tolist()
     tables: Delayed = delayed(dictionary_tables, pure=False)(
         names, disc, dictionary
     ).persist()
@@ -222,7 +222,7 @@ def _registrations(
     """Registrations of the takes of a cohort that can have one, and notes on them; a
     release is never registered again.
     """
-    takes = [str(take) for take in cohort["take"].values]
+    takes = cohort["take"].values.tolist()
     if release is not None:
         lookup = Lookup(db, release)
         names = [take for take in takes if lookup.has("registration", take)]
