@@ -38,7 +38,7 @@ from skindb.format.dome import (
     DomeRecord,
     Pinhole,
 )
-from skindb.schema import dataset
+from skindb.schema import GROUPS, dataset
 from skindb.types import Float32, Float64, Mask
 
 # the manufacturer's reference values, as in colour-science
@@ -57,27 +57,13 @@ GREEN = 1
 # picture, nor more than ten times that of a poor calibration
 MAX_REPROJECTION_MM = 2.5
 MAX_REPROJECTIONS_PX = (2.0, 10.0)
+# NaN for every variable of one camera
 UNKNOWN: Values = {
-    "calibrated_response": np.full((TABLE_ROWS, 3), np.nan),
-    "calibrated_read_noise": np.nan,
-    "calibrated_read_noise_error": np.nan,
-    "calibrated_electrons_per_value": np.nan,
-    "calibrated_electrons_per_value_error": np.nan,
-    "noise_chi_square": np.nan,
-    "calibrated_vignette": np.full(3, np.nan),
-    "calibrated_vignette_error": np.full(3, np.nan),
-    "vignette_residual": np.nan,
-    "calibrated_colour_matrix": np.full((3, 3), np.nan),
-    "calibrated_colour_matrix_error": np.full((3, 3), np.nan),
-    "chart_difference": np.nan,
-    "edge_blur": np.nan,
-    "edge_blur_error": np.nan,
-    "veiling_glare": np.nan,
-    "reprojection_rms": np.nan,
-    "reprojection_max": np.nan,
-    "dark_level": np.full(3, np.nan),
-    "dark_level_error": np.full(3, np.nan),
-    "defect_pixels": np.nan,
+    declared.name: np.full(
+        [TABLE_ROWS if dim == "response_level" else 3 for dim in declared.dims[1:]],
+        np.nan,
+    )
+    for declared in GROUPS["camera_calibration"]
 }
 
 
