@@ -2,7 +2,6 @@
 before they are used, requests with deadlines, and a log of all bytes.
 """
 
-import ast
 import binascii
 import math
 import os
@@ -49,7 +48,6 @@ WATCHDOG_SECONDS = 0.5
 SILENCE_SECONDS = 0.6  # without a request, after a STOP that a device did not confirm
 MAX_WAITING_EVENTS = 1_000  # the gauge of the probe sends ten in a second
 CURE = "check its power and its cable, then run the command again"
-LOG_PRECISION_SECONDS = 1e-4
 FIRMWARE_CURE = "correct the firmware, see docs/protocol.md"
 
 T_co = TypeVar("T_co", covariant=True)
@@ -539,69 +537,3 @@ def stopped_at_end(stop: Callable[[], None]) -> Iterator[None]:
         stop()
         raise
     stop()
-
-
-class ReplayPort:
-    """A port that replays a recorded session at the times of the recording.
-
-    Parameters
-    ----------
-    path
-        Log of a `Link`.
-    clock
-        Clock of the replay; with a simulated one it takes no time.
-
-    Raises
-    ------
-    DeviceError
-        If a request differs from the recorded one.
-    """
-
-    def __init__(self, path: Path, *, clock: Clock = SYSTEM_CLOCK) -> None:
-        self.path = path
-        self._clock = clock
-        self._start = clock.monotonic()
-        self._left = list[tuple[float, str, bytes]]()
-        for line in path.read_text(encoding="ascii").splitlines():
-            seconds, direction, text = line.split(" ", 2)
-            self._left.append((float(seconds), direction, _bytes(text)))
-
-    def read(self, size: int) -> bytes:  # noqa: ARG002
-        """Return the bytes that were recorded until now and before the next request of the host."""
-        data = self._due()
-        if data:
-            return data
-        self._clock.sleep(READ_SECONDS)
-        return self._due()
-
-    def _due(self) -> bytes:
-        seconds = self._clock.monotonic() - self._start + LOG_PRECISION_SECONDS
-        data = b""
-        while self._left and self._left[0][0] <= seconds and self._left[0][1] == "<":
-            data += self._left.pop(0)[2]
-        return data
-
-    def write(self, data: bytes) -> None:
-        """Compare the data with the recorded request."""
-        while self._left and self._left[0][1] == "<":  # late replies that were not used
-            self._left.pop(0)
-        recorded = self._left.pop(0)[2] if self._left else b"nothing more"
-        if recorded != data:
-            raise DeviceError(
-                Fault(
-                    str(self.path),
-                    f"the next request of a replay must be {recorded!r}",
-                    f"{data!r}",
-                    "replay it with the same commands",
-                )
-            )
-
-    def close(self) -> None:
-        """Do nothing: no file is open."""
-
-
-def _bytes(text: str) -> bytes:
-    value = ast.literal_eval(text)
-    if not isinstance(value, bytes):
-        raise ValueError(text)
-    return value

@@ -18,6 +18,7 @@ from devices_pair import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from replay import ReplayPort
 from served_devices import Server, Terminal
 
 from skindb.clock import SimulatedClock
@@ -37,7 +38,6 @@ from skindb.hw.link import (
     Link,
     Message,
     ProtocolError,
-    ReplayPort,
     checksum,
     decode,
     open_port,
