@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from skindb.view.page import PageServer
     from skindb.workflow import Outcome
 
+MAX_ALIKE = 10  # faults that break the same rule and are printed
 P = TypeVar("P", Path, Path | None)
 T = TypeVar("T")
 R = TypeVar("R")
@@ -226,20 +227,20 @@ def _placed(fault: Fault, item: str) -> Fault:
     )
 
 
-def fault_lines(
-    faults: Iterable[Fault], *, unlimited: bool, limit: int = 10
-) -> list[str]:
-    """One line for each fault; if more than `limit` break the same rule, the others are
+def fault_lines(faults: Iterable[Fault], *, unlimited: bool) -> list[str]:
+    """One line for each fault; if more than MAX_ALIKE break the same rule, the others are
     only counted unless `unlimited`.
     """
     lines = []
     count = Counter[str]()
     for fault in faults:
         count[fault.rule] += 1
-        if unlimited or count[fault.rule] <= limit:
+        if unlimited or count[fault.rule] <= MAX_ALIKE:
             lines.append(str(fault))
     folded = {
-        rule: n - limit for rule, n in count.items() if n > limit and not unlimited
+        rule: n - MAX_ALIKE
+        for rule, n in count.items()
+        if n > MAX_ALIKE and not unlimited
     }
     return lines + [
         f"and {n} more: {rule} (-v lists them)" for rule, n in folded.items()

@@ -49,11 +49,6 @@ class Moments:
     second: Array  # sum of squared deviations from the mean
 
     @classmethod
-    def zero(cls, shape: tuple[int, ...] = ()) -> Moments:
-        """Moments of an empty set."""
-        return cls(np.zeros(shape), np.zeros(shape), np.zeros(shape))
-
-    @classmethod
     def of(cls, values: Array) -> Moments:
         """Moments over the first axis; NaN counts as missing."""
         values = float64(values)

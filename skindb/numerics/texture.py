@@ -243,14 +243,14 @@ def image_parts(
     return [image, *build(image, levels, orientations).parts()]
 
 
-def part_names(levels: int = LEVELS, orientations: int = ORIENTATIONS) -> list[str]:
+def part_names() -> list[str]:
     """Names of `image_parts`; level 1 is the finest, and angles are those along which
     the image changes.
     """
-    angles = [180 * i // orientations for i in range(orientations)]
+    angles = [180 * i // ORIENTATIONS for i in range(ORIENTATIONS)]
     bands = [
         f"level {level + 1}, {angle} degrees"
-        for level in range(levels)
+        for level in range(LEVELS)
         for angle in angles
     ]
     return ["image", "high-pass", *bands, "low-pass"]

@@ -172,9 +172,7 @@ class Staleness:
         return self._snapshot
 
 
-def require_fresh(
-    db: Located, kind: str, take: str, generation: int | None = None
-) -> None:
+def require_fresh(db: Located, kind: str, take: str) -> None:
     """Raise an error or warn if a version is stale.
 
     Warns
@@ -188,7 +186,7 @@ def require_fresh(
         If an input was withdrawn or cannot be read, or if the consent of its subject no
         longer covers statistics.
     """
-    record = Snapshot(db.place).record(kind, take, generation)
+    record = Snapshot(db.place).record(kind, take)
     title = record.title
     reasons = Staleness(db).reasons(record)
     if refused := [reason for reason in reasons if reason.why != "superseded"]:

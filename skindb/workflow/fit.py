@@ -184,14 +184,9 @@ def plan_take(
     parameters: FitParameters | None = None,
     *,
     dictionary: Dictionary | None = None,
-    generation: int | None = None,
 ) -> FitPlan:
     """What `fit_take` would skip, and the bound on the error this costs."""
-    return plan_fit(
-        db.read("capture", take, generation=generation),
-        parameters,
-        dictionary=dictionary,
-    )
+    return plan_fit(db.read("capture", take), parameters, dictionary=dictionary)
 
 
 def takes_to_fit(
