@@ -398,7 +398,7 @@ def test_cli__fit_refuses_too_many_components_before_it_starts(small_database):
     _, db = small_database
     done = _run("fit", db, "V001", "--k", "100")
     assert done.returncode == 1
-    assert "1 to 59 components" in done.stderr
+    assert "1 to 67 components" in done.stderr
 
 
 @pytest.mark.slow
@@ -412,7 +412,7 @@ def test_cli__explain_plans_and_does_not_work(small_database, tmp_path):
         ]
         if "rank" in line
     ]
-    assert "43 of 59 are skipped (rank 16;" in line
+    assert "43 of 67 are skipped (rank 16;" in line
     assert _run("info", db).stdout == versions
     call = (
         "render",
@@ -700,7 +700,7 @@ def test_fit__faults_say_which_take_they_are_of(small_database):
     assert done.returncode == 2
     done = _run("fit", db, "V001", "absent", "--k", "99")
     assert (
-        "V001: k: a reduced basis of this dictionary has 1 to 59 components"
+        "V001: k: a reduced basis of this dictionary has 1 to 67 components"
         in done.stderr
     )
     assert "capture of absent: the database must hold it" in done.stderr

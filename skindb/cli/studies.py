@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from skindb.store import Database
+    from skindb.types import Progress
 
 ANALYSIS = Path(skindb.__file__).parent / "analysis"
 TAKES = click.option(
@@ -60,6 +61,15 @@ STORED = (
     click.option(
         "--csv", type=PATH, help="Table to write as comma-separated values (.csv)."
     ),
+)
+# of translucency, which can also draw takes
+FACES = (
+    click.Option(
+        ["--faces"],
+        type=PATH,
+        help="Picture of the least and the most translucent take (.png, .pdf, .svg).",
+    ),
+    click.Option(["--site"], help="Site of the probe for --faces.  [default: cheek]"),
 )
 
 
@@ -193,7 +203,10 @@ def _study_command(study: Declaration) -> click.Command:
         (TAKES, options_of(study.parameters), *STORED, SCHEDULER, common)
     ):
         run = add(run)
-    return click.command(study.name, help=f"Study the {study.description}.")(run)
+    command = click.command(study.name, help=f"Study the {study.description}.")(run)
+    if study.name == "translucency":
+        command.params += FACES
+    return command
 
 
 def _run_study(
@@ -205,11 +218,11 @@ def _run_study(
     name: str | None,
     scheduler: str | None,
     csv: Path | None,
-    plot: Path | None,
+    **drawn: Any,
 ) -> None:
     """Compute or read a study, and print, write and draw it."""
-    if plot:
-        writable(plot, ".png", ".pdf", ".svg")
+    pictures = StudyPictures(**drawn)
+    pictures.require_writable()
     if csv:
         writable(csv, ".csv")
     chosen = dict(vars(parameters))
@@ -222,7 +235,10 @@ def _run_study(
     progress = bar()
     progress(f"analyze {study.name}", 0, 1)
     studied = takes or database.takes("model", release=release)
-    with skindb.workflow.logged_action(database, "study", studied, what=study.name):
+    arguments = {"faces": pictures.faces is not None}
+    with skindb.workflow.logged_action(
+        database, "study", studied, what=study.name, arguments=arguments
+    ):
         with (
             client_of(scheduler, progress) as client,
             skindb.workflow.computing_on(client, database.folder),
@@ -231,9 +247,35 @@ def _run_study(
                 database, study.name, takes=takes, release=release, name=name, **chosen
             )
         progress(f"analyze {study.name}", 1, 1)
-        if plot:
-            skindb.analysis.plot_study(results, plot)
+        pictures.draw(database, results, progress)
     _report(database, study, results, csv)
+
+
+@dataclass(frozen=True)
+class StudyPictures:
+    """Pictures that a command draws of a study, if they are named."""
+
+    plot: Path | None
+    faces: Path | None = None  # of the most and the least translucent take
+    site: str | None = None  # of the faces
+
+    def require_writable(self) -> None:
+        """Check the names of the pictures before anything is computed."""
+        for picture in (self.plot, self.faces):
+            if picture:
+                writable(picture, ".png", ".pdf", ".svg")
+
+    def draw(
+        self, database: Database, results: xr.DataTree, progress: Progress
+    ) -> None:
+        """Draw the pictures."""
+        if self.faces:
+            site = self.site or "cheek"
+            skindb.workflow.translucency_grid(
+                database, self.faces, site=site, progress=progress
+            )
+        if self.plot:
+            skindb.analysis.plot_study(results, self.plot)
 
 
 def _report(

@@ -38,6 +38,7 @@ from .pictures import (
     landmark_page,
     render_take,
     show_take,
+    translucency_grid,
     view_server,
     view_takes,
 )
@@ -112,6 +113,7 @@ __all__ = [
     "superseded_lines",
     "takes_to_fit",
     "takes_without_consent",
+    "translucency_grid",
     "view_server",
     "view_takes",
     "withdraw",
