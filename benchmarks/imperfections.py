@@ -2,32 +2,50 @@
 their stated errors.
 
     python -m benchmarks imperfections DB CAPTURE [CAPTURE...]
+    python -m benchmarks imperfections DB CAPTURE [CAPTURE...] --refinement
 
 Each capture folder has its truth beside it as <folder>.truth.npz (keys of
 skindb.virtual.capture). The captures are ingested into DB, which must be new, and fitted
-with a tenth of the lights held out; with --corrected, ingest uses --refine and fit uses
---inter-reflection. The Markdown table has one row per capture: errors of normals and
-R_d, fraction of R_d within its 95 % interval, the median half-width of the interval,
-errors at held-out lights, and notes of ingest. The lines after the table pool the
-captures.
+with a tenth of the lights held out; with --corrected, ingest uses --refine on and fit
+--inter-reflection on, otherwise both are off. The Markdown table has one row per capture:
+errors of normals and R_d, fraction of R_d within its 95 % interval, the median half-width
+of the interval, errors at held-out lights, and notes of ingest. The lines after the table
+pool the captures.
+
+With --refinement, each capture is ingested with --refine off, on and auto. The table has
+what auto chose and why, the median errors of the normals of a tenth of the surfels, fitted
+up to the joint refinement, and the CPU times of the ingests.
 """
 
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import xarray as xr
 
 import skindb
-from benchmarks.truth import read_truth
+from benchmarks.truth import Truth, read_truth
 from benchmarks.validate import header
 from skindb.errors import InputError
-from skindb.fit import FitParameters
+from skindb.fit import (
+    FitParameters,
+    estimate_diffuse_reflectance,
+    estimate_normals,
+    lumitexels,
+    refine_jointly,
+)
+from skindb.schema import variables
 from skindb.store import Database
-from skindb.virtual.capture import recovered_against_true
+from skindb.virtual.capture import (
+    at_foot_points,
+    foot_points,
+    recovered_against_true,
+)
 from skindb.workflow import ingest_take
 from skindb.workflow.fit import fit_take
 
@@ -41,6 +59,16 @@ COLUMNS = (
     "obstructed [% of the scan]",
     "notes",
 )
+REFINEMENT_COLUMNS = (
+    "choice of auto",
+    "normals off [deg]",
+    "on",
+    "auto",
+    "CPU time of ingest off [s]",
+    "auto",
+)
+SURFEL_STEP = 10
+MIN_SAMPLES = 16
 
 
 def measure(db: Database, folder: Path, *, corrected: bool) -> dict[str, Any]:
@@ -73,6 +101,49 @@ def measure(db: Database, folder: Path, *, corrected: bool) -> dict[str, Any]:
     }
 
 
+def measure_refinement(db: Database, folder: Path) -> dict[str, Any]:
+    """Ingest one capture with each value of --refine, and compare the normals."""
+    result: dict[str, Any] = {"capture": folder.name, "cpu": {}, "normals": {}}
+    # the first one also loads compiled code; its time is not reported
+    for refine in (True, False, "auto"):
+        start = time.process_time()
+        ingested = ingest_take(db, folder, calibration="note", refine=refine)
+        result["cpu"][refine] = time.process_time() - start
+        if refine != "auto":
+            capture = db.read("capture", ingested.take)
+            result["normals"][refine] = normal_error(capture, read_truth(folder))
+    reason = ingested.provenance["summary"]["corrections"]["refine"]
+    # the samples are those of one of the others
+    result["normals"]["auto"] = result["normals"][reason.startswith("on")]
+    return result | {"reason": reason}
+
+
+def normal_error(capture: xr.DataTree, truth: Truth) -> float:
+    """Median error [deg] of the normals of one in `SURFEL_STEP` surfels after the joint
+    refinement.
+    """
+    count = capture["samples"]["sample_count"].values
+    few = np.flatnonzero(count >= MIN_SAMPLES)[::SURFEL_STEP]
+    samples = lumitexels(capture).isel(surfel=few).load()
+    eta = FitParameters().eta
+    fitted = estimate_normals(samples, eta=eta)
+    fitted = fitted.merge(estimate_diffuse_reflectance(samples.merge(fitted), eta=eta))
+    fitted = refine_jointly(samples.merge(fitted), eta=eta)
+    face, corner = foot_points(samples, truth)
+    true = at_foot_points(truth["normals"][truth["faces"][face]], corner)
+    true /= np.linalg.norm(true, axis=1, keepdims=True)
+    cosine = (fitted[variables.SHADING_NORMAL].values * true).sum(axis=1)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    return float(np.nanmedian(angle[face >= 0]))
+
+
+def refinement_row(r: dict[str, Any]) -> str:
+    """One row of the table of refinements."""
+    normals = [f"{r['normals'][refine]:.2f}" for refine in (False, True, "auto")]
+    seconds = [f"{r['cpu'][refine]:.1f}" for refine in (False, "auto")]
+    return f"| {r['capture']} | {' | '.join([r['reason'], *normals, *seconds])} |"
+
+
 def row(r: dict[str, Any]) -> str:
     """One row of the table."""
     if "refused" in r:
@@ -103,13 +174,21 @@ def main(
     captures: Sequence[Path],
     *,
     corrected: Annotated[
-        bool, "Ingest with --refine, and fit with --inter-reflection on."
+        bool, "Ingest with --refine on, and fit with --inter-reflection on."
     ] = False,
+    refinement: Annotated[bool, "Compare --refine off, on and auto instead."] = False,
     json_: Annotated[Path | None, "File for all results."] = None,
 ) -> None:
     """Measure and print."""
     db = skindb.open(db)
     results = []
+    if refinement:
+        print(header(*REFINEMENT_COLUMNS))
+        for folder in captures:
+            results.append(measure_refinement(db, folder))
+            print(refinement_row(results[-1]), flush=True)
+        save(results, json_)
+        return
     print(header(*COLUMNS))
     for folder in captures:
         try:
@@ -130,5 +209,10 @@ def main(
         print(
             f"Median half-width of the interval, R G B: {numbers(100 * width, '.0f')} %"
         )
-    if json_:
-        json_.write_text(json.dumps(results, indent=1, default=str), encoding="utf-8")
+    save(results, json_)
+
+
+def save(results: list[dict[str, Any]], file: Path | None) -> None:
+    """Write all results to a file, if one is given."""
+    if file:
+        file.write_text(json.dumps(results, indent=1, default=str), encoding="utf-8")

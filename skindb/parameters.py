@@ -334,7 +334,8 @@ class IngestParameters(Limited):
         it, or record a warning.
     refine
         Whether cameras are first rotated so that their photographs show the face at the
-        scan, see `refine_cameras`.
+        scan, see `skindb.ingest.refinement.refine_cameras`. "auto" decides by a trial,
+        see `choose_refinement` there.
     """
 
     spacing_mm: float = option(
@@ -369,8 +370,8 @@ class IngestParameters(Limited):
         "Treatment of captures whose photographs contradict their calibration: "
         "refused, or recorded as notes.",
     )
-    refine: bool = option(
-        False,
+    refine: bool | Literal["auto"] = option(
+        "auto",
         "Correct the orientation of each camera so that its photographs match the scan.",
     )
 

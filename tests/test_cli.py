@@ -322,6 +322,7 @@ def small_database(tmp_path_factory):
         r"samples per surfel: mean \d+ \(p5 \d+, .* of 64; \d+% of [\d,]+ surfels have any",
         taken.stdout,
     )
+    [chosen] = re.findall(r"^ +chosen: refine o(?:n|ff).*$", taken.stdout, re.M)
     done = _run(
         "fit", db, "--json", "--hold-out-lights", "0.01", "--hold-out-cameras", "0.01"
     )
@@ -338,6 +339,7 @@ def small_database(tmp_path_factory):
     )
     assert re.search(r"samples of +mean +p5 +p50 +p95 +max +seen\n +all ", said)
     assert "stretch 99 %" in said
+    assert chosen.strip() in said
     assert re.search(r"atlas by (intrinsic|mean-value) weights \(", said)
     # a tenth of the lights is one light
     assert len(report["held_out_lights"]) == len(report["held_out_cameras"]) == 1

@@ -26,6 +26,7 @@ from skindb.cli.options import (
 from skindb.cli.shared import (
     SCHEDULER,
     calibration_lines,
+    choice_lines,
     each_take,
     emit,
     shared_path,
@@ -259,6 +260,7 @@ def _ingested(
         lines += [
             f"  {line}" for line in skindb.ingest.sample_lines(figures["samples"])
         ]
+    lines += [f"  {line}" for line in choice_lines(figures.get("corrections", {}))]
     if asked("verbose"):
         lines += [f"  {line}" for line in calibration_lines(database, record.take)]
     lines += [f"  note: {line}" for line in figures.get("notes", [])]

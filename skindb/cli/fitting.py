@@ -26,6 +26,7 @@ from skindb.cli.options import (
 from skindb.cli.shared import (
     SCHEDULER,
     aligned,
+    choice_lines,
     each_take,
     emit,
     existing,
@@ -198,9 +199,7 @@ def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
     ]
     lines += [_suspect_line(entry) for entry in report["suspects"]]
     lines += _energy_lines(report.get("surface_energy", {}))
-    if reasons := report.get("corrections"):
-        choices = [f"{n.replace('_', ' ')} {r}" for n, r in reasons.items()]
-        lines.append(f"  chosen: {'; '.join(choices)}")
+    lines += [f"  {line}" for line in choice_lines(report.get("corrections", {}))]
     if gains := report.get("light_gains"):
         lines.append(
             f"  gains of the lights: standard deviation {gains['spread']:.1%}; "

@@ -9,7 +9,7 @@ import logging
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from itertools import repeat
@@ -324,6 +324,12 @@ def summary_of(record: Record) -> dict[str, Any]:
         name: record.provenance[name] for name in names if name in record.provenance
     }
     return {"generation": record.generation, "path": record.path, **parts}
+
+
+def choice_lines(corrections: Mapping[str, str]) -> list[str]:
+    """The corrections that were chosen by trials and why, in one line."""
+    choices = [f"{n.replace('_', ' ')} {why}" for n, why in corrections.items()]
+    return [f"chosen: {'; '.join(choices)}"] if choices else []
 
 
 def calibration_lines(database: Database, take: str) -> list[str]:

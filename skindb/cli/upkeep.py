@@ -15,7 +15,7 @@ import click
 import skindb
 from skindb.bench import KERNELS
 from skindb.cli.options import DB, PATH, asked, common
-from skindb.cli.shared import aligned, calibration_lines, emit, existing
+from skindb.cli.shared import aligned, calibration_lines, choice_lines, emit, existing
 from skindb.cli.subjects import stale_as_json
 from skindb.cli.terminal import bar
 from skindb.errors import Fault, InputError, input_error
@@ -177,8 +177,12 @@ def _atlas_lines(database: Database, take: str) -> list[str]:
 
 
 def _capture_lines(database: Database, take: str) -> list[str]:
+    summary = database.record("capture", take).provenance.get("summary", {})
     parts = (_sample_lines, _atlas_lines, calibration_lines)
-    return [line for part in parts for line in part(database, take)]
+    return [
+        *[line for part in parts for line in part(database, take)],
+        *choice_lines(summary.get("corrections", {})),
+    ]
 
 
 # kind: function of the lines that info -v adds

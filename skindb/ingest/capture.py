@@ -30,11 +30,7 @@ from skindb.format.dome import DomeRecord
 from skindb.format.folder import Capture
 from skindb.format.frames import Digests
 from skindb.geometry.rays import RayScene
-from skindb.ingest.consistency import (
-    CalibrationCheck,
-    applied_rotations,
-    refine_cameras,
-)
+from skindb.ingest.consistency import CalibrationCheck
 from skindb.ingest.faults import (
     calibration_faults,
     calibration_notes,
@@ -62,6 +58,14 @@ from skindb.ingest.lumitexels import (
     sample_lumitexels,
 )
 from skindb.ingest.probe_profiles import fibre_profiles, isotropy_p_values, probe_notes
+from skindb.ingest.refinement import (
+    applied_rotations,
+    choose_refinement,
+    held_out_lights,
+    pictures_to_judge,
+    reason_to_skip,
+    refine_cameras,
+)
 from skindb.ingest.report import (
     capture_provenance,
     describe_samples,
@@ -291,14 +295,15 @@ class _DomeStages:
             self.dome, surfels, light_fraction, clear, pixels, intensity
         )
         rotations = np.zeros((len(self.dome.cameras), 3))
-        if parameters.refine and not self.run.faults:
+        if parameters.refine is not False and not self.run.faults:
             refined = self._refined(check, mergers)
             if refined is None:
                 return {}
-            rotations = applied_rotations(self.dome, refined)
-            self.dome = refined
-            visible, clear, pixels = sees(refined.cameras)
-            check = replace(check, dome=refined, clear=clear, pixels=pixels)
+            if refined is not self.dome:
+                rotations = applied_rotations(self.dome, refined)
+                self.dome = refined
+                visible, clear, pixels = sees(refined.cameras)
+                check = replace(check, dome=refined, clear=clear, pixels=pixels)
             self.run.report("refine", 1, 1)
         lumitexels = self._lumitexels(mergers, check)
         if lumitexels is None:
@@ -318,13 +323,30 @@ class _DomeStages:
     def _refined(
         self, check: CalibrationCheck, mergers: Mapping[str, FrameMerger]
     ) -> DomeRecord | None:
-        """The dome with rotated cameras; None, with the faults of the pictures recorded,
-        if there are any.
+        """The dome with rotated cameras, or as it is if that is chosen; None, with the
+        faults of the pictures recorded, if there are any.
         """
+        choose = self.run.parameters.refine == "auto"
+        if choose and (reason := reason_to_skip(check)):
+            self._record(reason)
+            return self.dome
+        held_out = held_out_lights(check) if choose else frozenset[int]()
+        pairs = pictures_to_judge(check, held_out)
         pictures = attempt(
-            self.run.faults, lambda: checked_pictures(check, mergers, pool=self.pool)
+            self.run.faults,
+            lambda: checked_pictures(check, pairs, mergers, pool=self.pool),
         )
-        return None if pictures is None else refine_cameras(check, pictures)
+        if pictures is None:
+            return None
+        if not choose:
+            return refine_cameras(check, check.views(pictures))
+        dome, reason = choose_refinement(check, pictures, held_out)
+        self._record(reason)
+        return dome
+
+    def _record(self, reason: str) -> None:
+        """Record why the refinement was chosen or not."""
+        self.run.summary["corrections"] = {"refine": reason}
 
     def _lumitexels(
         self, mergers: Mapping[str, FrameMerger], check: CalibrationCheck
@@ -403,7 +425,7 @@ class _DomeStages:
             faults = calibration_faults(dome, calibration)
             self.run.notes += [str(fault) for fault in faults]
             self.run.notes += calibration_notes(dome, calibration)
-        self.run.summary = {
+        self.run.summary |= {
             "samples": describe_samples(lumitexels, self.run.surfels, dome)
         }
 

@@ -1,5 +1,5 @@
 """Check of a calibration against the photographs: poses of the cameras, and positions of
-the lights by the shading; rotations that align the cameras with the scan.
+the lights by the shading.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from skindb.calibration.irradiance import light_falloff
 from skindb.format.dome import CameraRecord, DomeRecord
@@ -56,8 +55,6 @@ MAX_OFFSET_MM = 10.0  # mm on the face, a tenth of a head's radius
 # gain in correlation, and correlation, from which another explanation is named
 BETTER_AGREEMENT = 0.1
 GOOD_AGREEMENT = 0.8
-ROUNDS = 2  # a third round shifted the photographs of four captures by at most 0.06 mm
-SMALL_TURN = 1e-4  # rad; step of the finite differences
 
 
 @dataclass(frozen=True)
@@ -110,9 +107,7 @@ class CalibrationCheck:
         """The views to compare; empty for a patch of skin."""
         if np.linalg.norm(np.ptp(self.surfels.position, axis=0)) < MIN_DIAGONAL_MM:
             return frozenset()
-        area = [self._seen_area(camera) for camera in self.dome.cameras]
-        # (light, camera) mm2 that are lit and visible
-        seen = (self.irradiance > 0) @ (np.stack(area, axis=1) * self._clear)
+        seen = self.seen_area
         pairs = {
             (int(j), c)
             for c in range(seen.shape[1])
@@ -121,6 +116,14 @@ class CalibrationCheck:
         pairs |= {(j, int(seen[j].argmax())) for j in range(seen.shape[0])}
         minimum = MIN_SEEN_FRACTION * seen.max()
         return frozenset(pair for pair in pairs if seen[pair] > minimum)
+
+    @cached_property
+    def seen_area(self) -> Float64:
+        """Area (light, camera) [mm2] that is lit and visible, projected to the camera."""
+        area = [self._projected_area(camera) for camera in self.dome.cameras]
+        return np.asarray(
+            (self.irradiance > 0) @ (np.stack(area, axis=1) * self._clear)
+        )
 
     @cached_property
     def irradiance(self) -> Float64:
@@ -141,7 +144,7 @@ class CalibrationCheck:
 
     def evaluate(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> Calibration:
         """Compare the downsampled pictures of `pairs` with the predictions."""
-        views = self._views(pictures)
+        views = self.views(pictures)
         offsets, albedo = self._offsets(views)
         agreement, length, scale = np.full((3, len(self.dome.cameras)), np.nan)
         for c, offset in offsets.items():
@@ -174,10 +177,14 @@ class CalibrationCheck:
         )
 
     def good_offsets(
-        self, pictures: Mapping[Pair, NDArray[np.float32]]
+        self,
+        views: Sequence[ReducedView],
+        start: Mapping[int, Offset] | None = None,
     ) -> dict[int, Offset]:
-        """Offset of each camera whose photographs show the face near the scan."""
-        offsets, _ = self._offsets(self._views(pictures))
+        """Offset of each camera whose photographs show the face near the scan; with
+        `start` the search begins at these.
+        """
+        offsets, _ = self._offsets(views, start)
         wrong = self._wrong(offsets)
         return {c: offset for c, offset in offsets.items() if c not in wrong}
 
@@ -222,11 +229,16 @@ class CalibrationCheck:
     def _middle(self) -> Float64:
         return np.asarray(self.surfels.position.mean(axis=0))
 
-    def _seen_area(self, camera: CameraRecord) -> Float64:
-        """Area (n,) [mm2] of the surfels, projected towards the camera."""
+    def cosine(self, camera: CameraRecord) -> Float64:
+        """Cosine (n,) between the normals of the surfels and the direction to the camera."""
         way = camera.centre - self._position
-        cosine = np.einsum("ni,ni->n", way, self._normal) / np.linalg.norm(way, axis=1)
-        return np.asarray(np.maximum(cosine, 0) * self.surfels.area[self.compared])
+        length = np.linalg.norm(way, axis=1)
+        return np.asarray(np.einsum("ni,ni->n", way, self._normal) / length)
+
+    def _projected_area(self, camera: CameraRecord) -> Float64:
+        """Area (n,) [mm2] of the surfels, projected towards the camera."""
+        area = self.surfels.area[self.compared]
+        return np.asarray(np.maximum(self.cosine(camera), 0) * area)
 
     def factor(self, camera: int) -> int:
         """Downsampling factor of a camera."""
@@ -242,7 +254,7 @@ class CalibrationCheck:
         pixels = self.pixels[self.compared, camera].astype(np.float64)
         return pixels / self.factor(camera)
 
-    def _views(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> list[ReducedView]:
+    def views(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> list[ReducedView]:
         """Views with enough surfels of varying irradiance that are not black, as they
         are when a lamp fails.
         """
@@ -256,7 +268,7 @@ class CalibrationCheck:
                 root
             ):
                 continue
-            image = square_root_image(picture.mean(axis=2))
+            image = square_root_image(np.einsum("hwc->hw", picture) / 3)
             view = ReducedView(j, c, image, self._reduced_pixels(c), clear)
             seen = bilinear(view.image, view.pixels[clear])
             views.append(view)
@@ -267,23 +279,32 @@ class CalibrationCheck:
             v for v, ratio in zip(views, brightness, strict=True) if ratio > minimum
         ]
 
+    def projected(self, views: Sequence[ReducedView]) -> list[ReducedView]:
+        """The views with the pixels of this check."""
+        return [
+            replace(view, pixels=self._reduced_pixels(view.camera)) for view in views
+        ]
+
     def _offsets(
-        self, views: Sequence[ReducedView]
+        self,
+        views: Sequence[ReducedView],
+        start: Mapping[int, Offset] | None = None,
     ) -> tuple[dict[int, Offset], Float64]:
         """Offset of every camera, and albedo of the surfels."""
         albedo = np.ones(len(self._position))
         offsets = dict[int, Offset]()
+        earlier = dict(start or {})
         if not views:
             return offsets, albedo
         by_camera = dict[int, list[ReducedView]]()
         for view in sorted(views, key=lambda view: view.camera):
             by_camera.setdefault(view.camera, []).append(view)
         for turn in range(ALBEDO_ROUNDS + 1):
-            search = turn in (0, ALBEDO_ROUNDS)
             for c, camera_views in by_camera.items():
                 offsets[c] = camera_offset(
-                    camera_views, self.irradiance, albedo, search=search
+                    camera_views, self.irradiance, albedo, start=earlier.get(c)
                 )
+            earlier = offsets
             # wrong photographs would produce an albedo that agrees with them
             if turn < ALBEDO_ROUNDS:
                 wrong = self._wrong(offsets)
@@ -372,7 +393,7 @@ class CalibrationCheck:
         turned_pixels, depth = project(
             self._position, turned.K, turned.R, turned.t, turned.distortion
         )
-        visible = (self._seen_area(turned) > 0) & (depth > 0)
+        visible = (self.cosine(turned) > 0) & (depth > 0)
         visible &= np.isfinite(turned_pixels).all(axis=1)
         yield (
             "R looks transposed",
@@ -421,75 +442,3 @@ class CalibrationCheck:
         ]
         moves = offset.moves(self.pixels[self.compared, c][surfels] / factor)
         return np.stack(slopes, axis=-1).reshape(-1, 6), moves.ravel()
-
-
-def refine_cameras(
-    check: CalibrationCheck, pictures: Mapping[Pair, NDArray[np.float32]]
-) -> DomeRecord:
-    """The dome with every camera rotated about its centre so that its photographs show
-    the face at the scan.
-
-    A face is nearly flat as seen from a dome: shifts and rolls of its picture also
-    compensate for errors of the principal point, of the position of the camera and of
-    the pose of the scan. Cameras whose photographs show the face more than 10 mm away
-    from the scan are not rotated.
-
-    Parameters
-    ----------
-    check
-        Check of the dome as calibrated.
-    pictures
-        The downsampled photographs of `check.pairs`.
-    """
-    for _ in range(ROUNDS):
-        turns = {
-            c: _turn(check, c, offset)
-            for c, offset in check.good_offsets(pictures).items()
-        }
-        cameras = tuple(
-            _turned(camera, turns[c]) if c in turns else camera
-            for c, camera in enumerate(check.dome.cameras)
-        )
-        pixels = check.pixels.copy()
-        for c in turns:
-            camera = cameras[c]
-            pixels[:, c] = camera.project(check.surfels.position)
-        check = replace(check, dome=replace(check.dome, cameras=cameras), pixels=pixels)
-    return check.dome
-
-
-def applied_rotations(before: DomeRecord, after: DomeRecord) -> Float64:
-    """Rotation vectors (camera, 3) [degrees] about the axes of each camera, from
-    `before` to `after`.
-    """
-    pairs = zip(after.cameras, before.cameras, strict=True)
-    return np.array(
-        [
-            Rotation.from_matrix(new.R @ old.R.T).as_rotvec(degrees=True)
-            for new, old in pairs
-        ]
-    )
-
-
-def _turn(check: CalibrationCheck, c: int, offset: Offset) -> Float64:
-    """Rotation vector (3,) [rad] in the frame of camera c that compensates for its offset."""
-    points = check.surfels.position[check.compared][check.clear[check.compared, c]]
-    camera = check.dome.cameras[c]
-
-    def pixels(turn: Float64) -> Float64:
-        return _turned(camera, turn).project(points) / check.factor(c)
-
-    moves = offset.moves(pixels(np.zeros(3)))
-    slopes = [
-        (pixels(SMALL_TURN * axis) - pixels(-SMALL_TURN * axis)).ravel()
-        / (2 * SMALL_TURN)
-        for axis in np.eye(3)
-    ]
-    matrix = np.stack(slopes, axis=1)
-    return np.asarray(np.linalg.lstsq(matrix, moves.ravel(), rcond=None)[0])
-
-
-def _turned(camera: CameraRecord, turn: Float64) -> CameraRecord:
-    """The camera rotated about its centre by a rotation vector [rad] in its own frame."""
-    rotation = Rotation.from_rotvec(turn).as_matrix()
-    return replace(camera, R=rotation @ camera.R, t=rotation @ camera.t)

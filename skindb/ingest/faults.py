@@ -338,7 +338,7 @@ def _camera_notes(dome: DomeRecord, calibration: Calibration) -> Iterator[str]:
     if shift > DOUBTFUL_SCAN_MM or turn > DOUBTFUL_SCAN_DEGREES:
         yield (
             f"the scan is not where the photographs show the face; {_pose(calibration)}; "
-            "use --refine to compensate"
+            "use --refine on to compensate"
         )
         offsets = calibration.camera_residual
     for camera, offset, scale, agreement in zip(
@@ -351,7 +351,7 @@ def _camera_notes(dome: DomeRecord, calibration: Calibration) -> Iterator[str]:
         if offset > DOUBTFUL_OFFSET_MM or abs(scale) > DOUBTFUL_SCALE:
             yield (
                 f"camera {camera.id}: its photographs show the face {_beside(offset, scale)}; "
-                "calibrate it again, or ingest with --refine"
+                "calibrate it again, or ingest with --refine on"
             )
         elif agreement < DOUBTFUL_AGREEMENT:
             yield (

@@ -336,9 +336,13 @@ class _Sampler:
 
 
 def checked_pictures(
-    check: CalibrationCheck, mergers: Mapping[str, FrameMerger], *, pool: Executor
+    check: CalibrationCheck,
+    pairs: Collection[Pair],
+    mergers: Mapping[str, FrameMerger],
+    *,
+    pool: Executor,
 ) -> dict[Pair, NDArray[np.float32]]:
-    """The downsampled photographs of the pairs of a check, before anything is sampled.
+    """The downsampled photographs of these views, before anything is sampled.
 
     Raises
     ------
@@ -354,14 +358,14 @@ def checked_pictures(
         frames = checked_view(dome, dome.lights[j].id, merger)
         return check.reduce(c, _without_saturated(*merger.merge(frames)))
 
-    pairs = sorted(check.pairs)
+    ordered = sorted(pairs)
     call = partial(attempt, faults)
-    pictures = list(_in_turn(pool, lambda pair: call(partial(picture, pair)), pairs))
+    pictures = list(_in_turn(pool, lambda pair: call(partial(picture, pair)), ordered))
     if faults:
         raise InputError(faults)
     return {
         pair: image
-        for pair, image in zip(pairs, pictures, strict=True)
+        for pair, image in zip(ordered, pictures, strict=True)
         if image is not None
     }
 

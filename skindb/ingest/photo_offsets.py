@@ -24,7 +24,7 @@ PIXEL_MM = 2.0  # mm; about the width of an eyelid, well below the offsets to be
 SMOOTHING_PX = 0.7  # px of the downsampled picture; makes its derivatives smooth
 # number of Gauss-Newton steps, and step length in px at which they stop
 MAX_STEPS = 12
-SMALL_STEP = 1e-3
+SMALL_STEP = 0.01
 # range of the search for large offsets in radii of the face, and steps per side
 SEARCH_RADII = 0.75
 SEARCH_STEPS = 7
@@ -69,6 +69,12 @@ class Offset:
     # (2,) px, centroid of the visible surfels, the centre of roll and scale
     middle: Float64
     radius: float  # px, root mean square distance of the surfels from their centroid
+
+    @property
+    def parameters(self) -> Float64:
+        """Shift, and displacements at the radius by scale and roll, (4,) [px]."""
+        along = [self.scale * self.radius, self.roll * self.radius]
+        return np.concatenate([self.shift, along])
 
     @property
     def length(self) -> float:
@@ -121,7 +127,7 @@ def camera_offset(
     irradiance: Float64,
     albedo: Float64,
     *,
-    search: bool = True,
+    start: Offset | None = None,
 ) -> Offset:
     """Similarity of the picture that brings the photographs of one camera and the
     predictions together.
@@ -134,8 +140,9 @@ def camera_offset(
         (light, n) at the surfels, 0 in shadow.
     albedo
         (n,) of the surfels, in any unit.
-    search
-        Also search for large offsets, which Gauss-Newton steps would not reach.
+    start
+        Offset from which the Gauss-Newton steps start, unless no offset agrees better;
+        without it, large offsets, which these steps would not reach, are searched.
     """
     surfels = np.flatnonzero(views[0].clear)
     pixels = views[0].pixels[surfels]
@@ -160,13 +167,15 @@ def camera_offset(
     moves[:, :, 2] = away
     moves[:, 0, 3] = -away[:, 1]
     moves[:, 1, 3] = away[:, 0]
-    start = np.zeros(4)
-    if search:
-        start[:2] = _large_shift(images, predicted, pixels, radius)
-    move = _gauss_newton(images, predicted, pixels, moves, start)
+    first = np.zeros(4)
+    if start is None:
+        first[:2] = _large_shift(images, predicted, pixels, radius)
+    elif agreement(pixels + moves @ start.parameters) > agreement(pixels):
+        first = start.parameters
+    move = _gauss_newton(images, predicted, pixels, moves, first)
     aligned = agreement(pixels + moves @ move) if np.isfinite(move).all() else -np.inf
-    if aligned < (coarse := agreement(pixels + moves @ start)):
-        move = start
+    if aligned < (coarse := agreement(pixels + moves @ first)):
+        move = first
         aligned = coarse
     shift = move[:2].copy()
     scale, roll = (move[2:] / radius).tolist()

@@ -95,7 +95,7 @@ def ingest_take(
         Called with the stage, the number of finished steps and the total number of steps.
     **parameters
         Of `skindb.ingest.IngestParameters`: spacing_mm, photographs, soft, footprint,
-        visibility, calibration.
+        visibility, calibration, refine.
 
     Returns
     -------

@@ -264,7 +264,7 @@ def test_ingest_capture__provenance(take):
         "footprint": False,
         "visibility": "rays",
         "calibration": "refuse",
-        "refine": False,
+        "refine": "auto",
     }
     assert {
         "capture.json",

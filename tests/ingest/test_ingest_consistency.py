@@ -20,11 +20,7 @@ from skindb.errors import InputError
 from skindb.format.folder import read_capture
 from skindb.geometry.rays import RayScene
 from skindb.ingest import IngestParameters, ingest_capture
-from skindb.ingest.consistency import (
-    CalibrationCheck,
-    applied_rotations,
-    refine_cameras,
-)
+from skindb.ingest.consistency import CalibrationCheck
 from skindb.ingest.faults import calibration_faults, calibration_notes
 from skindb.ingest.photo_offsets import (
     ReducedView,
@@ -35,6 +31,15 @@ from skindb.ingest.photo_offsets import (
     reduced,
     relative_brightness,
     square_root_image,
+)
+from skindb.ingest.refinement import (
+    applied_rotations,
+    camera_differences,
+    choose_refinement,
+    held_out_lights,
+    pictures_to_judge,
+    reason_to_skip,
+    refine_cameras,
 )
 from skindb.ingest.surfels import build_surfels, camera_visibility, light_visibility
 from skindb.parameters import SimulationParameters
@@ -364,6 +369,11 @@ def _check(shoot):
     }
 
 
+def _refined(shoot):
+    check, pictures = _check(shoot)
+    return refine_cameras(check, check.views(pictures))
+
+
 @pytest.mark.slow
 def test_refine_cameras__turns_back_what_was_turned(shoot):
     """Rationale: shifts are found to 1.5 mm where pixels are 4 mm. Planted: 0.6
@@ -372,7 +382,7 @@ def test_refine_cameras__turns_back_what_was_turned(shoot):
     camera = shoot.dome.cameras[1]
     turn = Rotation.from_rotvec([0.004, -0.008, 0.01]).as_matrix()
     wrong = _camera(shoot, 1, R=turn @ camera.R, t=turn @ camera.t)
-    still, planted = (refine_cameras(*_check(one)) for one in (shoot, wrong))
+    still, planted = (_refined(one) for one in (shoot, wrong))
     distance = np.linalg.norm(camera.t)
     for refined in (still, planted):
         for c, own in enumerate(shoot.dome.cameras):
@@ -390,8 +400,128 @@ def test_refine_cameras__turns_back_what_was_turned(shoot):
 
 def test_refine_cameras__leaves_cameras_that_show_something_else(shoot):
     mirrored = _of_1(lambda image: image[:, ::-1])(shoot)
-    refined = refine_cameras(*_check(mirrored))
+    refined = _refined(mirrored)
     np.testing.assert_array_equal(refined.cameras[1].R, shoot.dome.cameras[1].R)
+
+
+def _misplaced(dome):
+    """The dome with cameras that are turned by 5 mm on the face, in different directions,
+    more than the pixels of 4 mm.
+    """
+    turns = [
+        [0.005, 0.002, 0],
+        [-0.004, 0.004, 0],
+        [0.001, -0.006, 0],
+        [0.004, 0.005, 0],
+    ]
+    cameras = []
+    for camera, turn in zip(dome.cameras, turns, strict=True):
+        rotation = Rotation.from_rotvec(turn).as_matrix()
+        cameras.append(replace(camera, R=rotation @ camera.R, t=rotation @ camera.t))
+    return replace(dome, cameras=tuple(cameras))
+
+
+def _chosen(shoot):
+    check, _ = _check(shoot)
+    assert reason_to_skip(check) == ""
+    held_out = held_out_lights(check)
+    pictures = {
+        (j, c): check.reduce(c, shoot.pictures[j, c])
+        for j, c in pictures_to_judge(check, held_out)
+    }
+    return choose_refinement(check, pictures, held_out)
+
+
+@pytest.mark.slow
+def test_choose_refinement__keeps_that_of_misplaced_cameras_alone(shoot):
+    dome, reason = _chosen(shoot)
+    assert dome is shoot.dome
+    assert reason.startswith("off: not needed, as it changes differences")
+    wrong = replace(shoot, dome=_misplaced(shoot.dome))
+    dome, reason = _chosen(wrong)
+    assert reason.startswith("on, as it changes differences between cameras by -")
+    pairs = zip(dome.cameras, wrong.dome.cameras, shoot.dome.cameras, strict=True)
+    for refined, planted, true in pairs:
+        before, after = (
+            Rotation.from_matrix(camera.R @ true.R.T).magnitude()
+            for camera in (planted, refined)
+        )
+        assert after < 0.004 < before  # rad, 3.5 mm, less than a pixel, roll included
+
+
+def test_choose_refinement__is_judged_by_the_held_out_lights(shoot):
+    """Cameras are misplaced, but photographs under these lights contradict it."""
+    wrong = replace(shoot, dome=_misplaced(shoot.dome))
+    check, _ = _check(wrong)
+    held_out = held_out_lights(check)
+    assert len(held_out) == 4
+    assert {j for j, _ in check.pairs} - held_out
+    flipped = {
+        (j, c): check.reduce(c, shoot.pictures[j, c])[:: -1 if j in held_out else 1]
+        for j, c in pictures_to_judge(check, held_out)
+    }
+    dome, reason = choose_refinement(check, flipped, held_out)
+    assert dome is check.dome
+    assert reason.startswith("off: not needed")
+
+
+def test_camera_differences__ignore_factors_of_cameras(shoot):
+    check, _ = _check(shoot)
+    pictures = {
+        (j, c): check.reduce(c, shoot.pictures[j, c]) for j in (0, 1) for c in range(3)
+    }
+    brighter = {(j, c): image * np.float32(1 + c) for (j, c), image in pictures.items()}
+    expected = camera_differences(check, check.views(pictures))
+    assert set(expected) == {
+        (j, *ab) for j in (0, 1) for ab in ((0, 1), (0, 2), (1, 2))
+    }
+    actual = camera_differences(check, check.views(brighter))
+    for key, difference in expected.items():
+        assert actual[key] == pytest.approx(difference, rel=1e-5)  # of float32
+
+
+def test_reason_to_skip__names_what_is_missing(shoot):
+    few = replace(shoot, dome=replace(shoot.dome, cameras=shoot.dome.cameras[:1]))
+    check, _ = _check(few)
+    assert reason_to_skip(check).endswith("8 or more lights, not 1 and 14")
+    lights = check.dome.lights[:7]
+    check, _ = _check(replace(shoot, dome=replace(shoot.dome, lights=lights)))
+    assert reason_to_skip(check).endswith("8 or more lights, not 4 and 7")
+    patch = replace(shoot.surfels, position=shoot.surfels.position * 0.5)
+    small = CalibrationCheck(shoot.dome, patch, *[None] * 4)
+    assert reason_to_skip(small) == (
+        "off: skipped, as the photographs show too little of a face"
+    )
+
+
+def test_choose_refinement__without_common_views_is_skipped(shoot):
+    check, pictures = _check(shoot)
+    held_out = held_out_lights(check)
+    few = {pair: image for pair, image in pictures.items() if pair[1] == 0}
+    dome, reason = choose_refinement(check, few, held_out)
+    assert dome is check.dome
+    assert reason == "off: skipped, as too few cameras see the same part of the face"
+
+
+@pytest.mark.slow
+def test_ingest_capture__refine_auto_records_its_choice(shoot, tmp_path):
+    parameters = IngestParameters(spacing_mm=4.0)
+    capture = read_capture(shoot.folder)
+    for dome, word in (
+        (capture.dome, "off: not needed,"),
+        (_misplaced(capture.dome), "on,"),
+    ):
+        with ingest_capture(
+            replace(capture, dome=dome), parameters, scratch=tmp_path
+        ) as tree:
+            reason = tree.attrs["summary"]["corrections"]["refine"]
+            applied = tree["calibration/camera_rotation_applied"].values
+            rotation = tree["dome/camera_rotation"].values
+        assert reason.startswith(word)
+        assert np.abs(applied).max() == 0 or word == "on,"
+        for refined, true in zip(rotation, capture.dome.cameras, strict=True):
+            left = Rotation.from_matrix(refined @ true.R.T).magnitude()
+            assert left < 0.004  # rad, 3.5 mm, less than a pixel, roll included
 
 
 @pytest.mark.slow
