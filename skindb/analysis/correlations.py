@@ -116,11 +116,9 @@ def component_correlations(
     values_of_pairs, low, high, p, count = (
         np.array(column) for column in zip(*rows, strict=True)
     )
-    flags = (
-        []
-        if count.min() >= FEW
-        else [f"fewer than {FEW} subjects: there are no intervals"]
-    )
+    flags = []
+    if count.min() < FEW:
+        flags.append(f"fewer than {FEW} subjects: there are no intervals")
     return dataset(
         {
             variables.COMPONENT_CORRELATION: values_of_pairs,

@@ -205,12 +205,9 @@ def read_dome(
     elif not calibrated:
         unknown = [light.id for light in lights if light.intensity is None]
         if unknown:
-            fields.fault(
-                "white",
-                "lights need an intensity or a white target",
-                f"{len(unknown)} lights without intensity, first {unknown[0]}",
-                "measure one of them",
-            )
+            rule = "lights need an intensity or a white target"
+            finding = f"{len(unknown)} lights without intensity, first {unknown[0]}"
+            fields.fault("white", rule, finding, "measure one of them")
     # version 1 keeps the sequence as an unchecked attribute
     sequence = None
     if version > 1 and fields.has("sequence"):

@@ -587,14 +587,9 @@ def dome_unit_faults(
         ]
     if span < (LEAST_SPAN if diagonal > FACE_DIAGONAL else PATCH_SPAN):
         cure = rescaling(likely_unit(USUAL_SPAN / span, 1.0))
-        return [
-            Fault(
-                where,
-                "lengths must be in mm, and the scan must be visible in the pictures",
-                f"{diagonal:,.0f} mm across, it spans {span:.2%} of a picture's side",
-                cure,
-            )
-        ]
+        rule = "lengths must be in mm, and the scan must be visible in the pictures"
+        finding = f"{diagonal:,.0f} mm across, it spans {span:.2%} of a picture's side"
+        return [Fault(where, rule, finding, cure)]
     return []
 
 

@@ -142,11 +142,9 @@ def connect(bucket: str, prefix: str) -> S3Store:
         )
     except (BaseError, ValueError, TypeError):
         # the text of the error may contain secret values of variables
+        rule = "the AWS_ variables must have valid values"
         raise input_error(
-            f"s3://{bucket}",
-            "the AWS_ variables must have valid values",
-            "an invalid value",
-            "correct them",
+            f"s3://{bucket}", rule, "an invalid value", "correct them"
         ) from None
 
 
