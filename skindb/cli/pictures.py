@@ -156,6 +156,7 @@ def compare(
             "camera": c.camera,
             "held_out": c.held_out,
             **c.error,
+            "filled": c.filled,
             "regions": c.regions,
             "causes": asdict(c.causes),
             "likely_causes": c.causes.notable,

@@ -4,16 +4,16 @@ parts of the face reflect with one diffuse bounce.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from skindb.errors import Fault, InputError
 from skindb.fit.lumitexels import cosines, directions
-from skindb.geometry.rays import RAY_OFFSET_MM, RayScene
+from skindb.geometry.interreflection import bounce_transfer, tangent_frames
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.schema import check, dataset
 from skindb.types import Array
@@ -36,11 +36,7 @@ SMALLEST_SHADING = 0.2
 # other surfaces, with errors of the lights of 0 to 15 %, errors of 0.2 to 2.5 % remain
 # (docs/validation.md).
 PRIOR = 0.03
-# per surfel, cosine distributed: the error of the incoming light is an eighth of its
-# standard deviation
-RAYS = 64
-SURFELS_PER_BLOCK = 2048
-FARTHEST_MM = 300.0  # mm; a head is smaller
+SURFELS_PER_BLOCK = 2048  # whose bounced light is gathered at once
 NEEDED = ("surfel_position", "surfel_normal", "light_position", "camera_position")
 
 
@@ -96,7 +92,7 @@ def estimate_light_gains(
     to_camera = directions(position, camera)
     lit = cosines(normal, to_light)
     seen = cosines(normal, to_camera)
-    for i, axes in enumerate(_frames(normal)):
+    for i, axes in enumerate(tangent_frames(normal)):
         shading = _shading(to_light[i] @ axes.T, eta)
         for c in np.flatnonzero(seen[i] > MIN_COSINE_GAIN):
             half = (lit[i] + seen[i, c]) / np.linalg.norm(
@@ -181,13 +177,6 @@ def _gains(matrix: Array) -> Array:
     )
 
 
-def _frames(normal: Array) -> Array:
-    """Two tangents and the normal of each surfel, in the rows of (n, 3, 3)."""
-    tangent = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    return np.stack([tangent, np.cross(normal, tangent), normal], axis=1)
-
-
 def _shading(direction: Array, eta: float) -> Array:
     """F_t times each coordinate (light, SMOOTH) of directions (light, 3) in the frame
     of the surfel.
@@ -247,19 +236,13 @@ def bounced_light(
     reflectance = np.where(
         np.isfinite(diffuse), diffuse, np.nanmedian(diffuse, axis=0)
     ).astype(np.float32)
-    scene = RayScene(position, triangles)
-    rays = _cosine_rays()
     wanted = np.arange(len(position))[receivers]
-    parts = [
-        wanted[begin : begin + SURFELS_PER_BLOCK]
-        for begin in range(0, len(wanted), SURFELS_PER_BLOCK)
-    ]
-    meetings = [
-        _meetings(scene, position[part], normal[part], rays, triangles, normal, eta)
-        for part in parts
-    ]
-    met = np.concatenate([np.zeros(0, np.int64), *(met for _, met, _ in meetings)])
-    senders = np.unique(met)
+    transmittance = partial(fresnel_transmittance, eta=eta)
+    transfer = bounce_transfer(
+        position, normal, triangles, transmittance, receivers=wanted
+    )
+    senders = np.unique(transfer.indices)
+    transfer = transfer[:, senders]
     # transmitted light of each lamp over its intensity
     lit = cosines(normal[senders], directions(position[senders], light))
     enters = (
@@ -269,15 +252,12 @@ def bounced_light(
     )
     sent = (enters / _square_distance(position[senders], light)).astype(np.float32)
     out = np.zeros((len(wanted), len(light), reflectance.shape[1]), np.float32)
-    begin = 0
-    for part, (receiver, met, weight) in zip(parts, meetings, strict=True):
-        column = np.searchsorted(senders, met)
-        square = _square_distance(position[part], light)
+    for begin in range(0, len(wanted), SURFELS_PER_BLOCK):
+        block = slice(begin, begin + SURFELS_PER_BLOCK)
+        square = _square_distance(position[wanted[block]], light)
         for c in range(reflectance.shape[1]):
-            entries = (weight * reflectance[met, c], (receiver, column))
-            gathered = csr_array(entries, shape=(len(part), len(senders))) @ sent
-            out[begin : begin + len(part), :, c] = gathered * square
-        begin += len(part)
+            reflected = transfer[block].multiply(reflectance[senders, c]).tocsr()
+            out[block, :, c] = (reflected @ sent) * square
     return out
 
 
@@ -321,41 +301,3 @@ def without_bounce(
         .transpose(*sample.dims)
     )
     return lumitexels.assign(reflectance_sample=direct.assign_attrs(sample.attrs))
-
-
-def _meetings(
-    scene: RayScene,
-    position: Array,
-    normal: Array,
-    rays: Array,
-    triangles: NDArray[Any],
-    normals: Array,
-    eta: float,
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
-    """Pairs of surfels (m,) of a block and the surfels (m,) that their rays hit, with
-    weights (m,).
-    """
-    way = np.einsum("rk,nkj->nrj", rays, _frames(normal)).reshape(-1, 3)
-    start = np.repeat(position + RAY_OFFSET_MM * normal, len(rays), axis=0)
-    face, corner, distance = scene.first_hit(start, way)
-    hit = np.flatnonzero((face >= 0) & (distance < FARTHEST_MM))
-    met = triangles[face[hit], corner[hit].argmax(axis=1)].astype(np.int64)
-    leaving = -np.einsum("nk,nk->n", way[hit], normals[met])
-    arriving = rays[hit % len(rays), 2]
-    weight = (
-        fresnel_transmittance(np.clip(leaving, 1e-3, 1), eta)
-        * fresnel_transmittance(arriving, eta)
-        / len(rays)
-    )
-    weight[leaving <= 0] = 0
-    return hit // len(rays), met, weight.astype(np.float32)
-
-
-def _cosine_rays() -> Array:
-    """Cosine-distributed directions (RAYS, 3) above z = 0, evenly spread (Vogel's spiral)."""
-    i = np.arange(RAYS) + 0.5
-    radius = np.sqrt(i / RAYS)
-    angle = np.pi * (3 - np.sqrt(5)) * i
-    return np.stack(
-        [radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)], axis=1
-    )

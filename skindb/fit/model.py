@@ -142,9 +142,12 @@ def first_pass(
     total = fitted["diffuse_reflectance_total_error"]
     total[:] = np.hypot(total.values, np.nan_to_num(error_of_misfit(fitted)))
     fitted["fit_status"][find_obstructed(fitted)] = FitStatus.OBSTRUCTED
-    index = label("refractive_index", parameters.eta)
+    scalars = {
+        "refractive_index": label("refractive_index", parameters.eta),
+        "inter_reflection": label("inter_reflection", int(parameters.inter_reflection)),
+    }
     devices = [name for name in ("light", "camera") if name in fitted.coords]
-    fitted = fitted.assign(refractive_index=index).drop_vars(devices)
+    fitted = fitted.assign(scalars).drop_vars(devices)
     first = xr.DataTree.from_dict({"fitted": fitted, "held_out": held_out, **groups})
     first.attrs = surface.provenance | {
         "parameters": parameters.as_dict() | surface.settings,

@@ -18,11 +18,13 @@ from skindb.reflectance.sampling import tangents
 from skindb.render.scene import Camera, Environment, Lights, Surface
 from skindb.render.shading import (
     View,
+    bounced_exitance,
     entering_light,
     escape_factor,
     exitance_from_irradiance,
     seen_points,
     trace_view,
+    transmitted_irradiance,
 )
 from skindb.types import Mask, Progress
 
@@ -134,7 +136,8 @@ def render_monte_carlo(
 ) -> Rendering:
     """Render a surface as the mean of independent batches of rays.
 
-    Interreflection between parts of the face is not included.
+    Light that parts of the face send to each other is added for the lights alone, and if
+    the surface asks for it.
 
     Parameters
     ----------
@@ -197,6 +200,9 @@ class _Painter:
     quality: Quality
     lobes: DirectionSampler
     choice: LightChoice | None  # None without lights
+    # (v, 3) `bounced_exitance` by the lights, from their centres: shadows of discs do not
+    # matter for it
+    bounced: Float | None
 
     @classmethod
     def of(
@@ -207,8 +213,12 @@ class _Painter:
         if lights is not None and len(lights):
             middle = surface.vertices[surface.known].mean(axis=0)
             choice = LightChoice.of_lights(lights, middle)
+        bounced = None
+        if lights is not None and surface.inter_reflection:
+            received = transmitted_irradiance(surface, lights, scene)
+            bounced = bounced_exitance(surface, received @ lights.intensity)
         lobes = surface.model.sampler()
-        return cls(surface, scene, lighting, quality, lobes, choice)
+        return cls(surface, scene, lighting, quality, lobes, choice, bounced)
 
     def batch(self, view: View, rng: np.random.Generator) -> Image:
         """One independent estimate of the picture (h, w, 3)."""
@@ -225,14 +235,18 @@ class _Painter:
             values += self._by_lights(hits, self.choice, rng)
         if self.lighting.environment is not None:
             values += self._by_environment(hits, self.lighting.environment, rng)
+        exitances = []
         if subsurface:
-            glow = exitance_from_irradiance(
-                surface,
-                self._received(rng),
-                view.shown(len(surface.vertices)),
-                tolerance=self.quality.tolerance,
-            )
-            values += escape_factor(view, surface.eta) * view.interpolate(glow)
+            shown = view.shown(len(surface.vertices))
+            received = self._received(rng)
+            tolerance = self.quality.tolerance
+            exitances += [
+                exitance_from_irradiance(surface, received, shown, tolerance=tolerance)
+            ]
+        if self.bounced is not None and "diffuse" in terms:
+            exitances += [self.bounced]
+        for exitance in exitances:
+            values += escape_factor(view, surface.eta) * view.interpolate(exitance)
         return view.image(values)
 
     def _by_lights(

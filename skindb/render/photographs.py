@@ -301,6 +301,9 @@ class Comparison:
     photographed: NDArray[np.float32]  # (h, w, 3) radiance
     rendered: NDArray[np.float32]  # (h, w, 3) radiance
     mask: NDArray[np.bool_]  # (h, w) pixels compared
+    # part of these pixels that shows unfitted surfels, with the values of the nearest fitted
+    # ones
+    filled: float
     error: dict[str, float]  # from `compare_images`
     diffuse: NDArray[np.float32]  # (h, w, 3) diffuse part of the rendering
     regions: dict[str, dict[str, float]]  # the same errors for each region, by its name
@@ -314,7 +317,8 @@ def compare_photographs(
     subsurface: bool = False,
     samples: int = 2,
 ) -> list[Comparison]:
-    """Predict the photographs that ingest kept.
+    """Predict the photographs that ingest kept, by the whole face: surfels without a fit take
+    the values of the nearest fitted one, as in pictures.
 
     Parameters
     ----------
@@ -328,7 +332,7 @@ def compare_photographs(
     honour_consent(model.attrs, "export")
     photographs = _kept_photographs(capture)
     dome = capture["dome"].to_dataset()
-    surface = from_model(model)
+    surface = from_model(model, fill=True)
     if subsurface:
         require_translucency(surface)
     scene = RayScene(surface.vertices, surface.faces)
@@ -358,14 +362,14 @@ def compare_photographs(
         photo = radiance[: camera.height, : camera.width].astype(np.float32)
         mask = (view.coverage >= MIN_COVERAGE) & np.isfinite(photo).all(axis=-1)
         if not mask.any():
-            continue  # this camera sees no fitted surfel
+            continue  # this camera does not see the face
         light = str(dome["light"].values[at_light])
         name = str(dome["camera"].values[at_camera])
         is_unseen = light in unseen_lights or name in unseen_cameras
         taken = _Taken(photo, diffuse, gloss, mask)
         results.append(taken.compared(light, name, is_unseen, view, regions, doubtful))
     if not results:
-        rule = "at least one must show fitted surfels"
+        rule = "at least one must show the face"
         cure = "ingest the capture again with more --photographs"
         raise InputError(Fault("photographs", rule, "none", cure))
     return results
@@ -414,6 +418,7 @@ class _Taken:
         doubtful: NDArray[np.float64],
     ) -> Comparison:
         """Errors of the rendering, also by region, and their likely causes."""
+        unfitted = view.image(view.interpolate((doubtful == 1.0)[:, None]))[..., 0]
         rendered = self.diffuse + self.gloss
         error = compare_images(rendered, self.photo, mask=self.mask)
         by_region = _by_region(
@@ -433,6 +438,7 @@ class _Taken:
             self.photo,
             rendered,
             self.mask,
+            float(unfitted[self.mask].mean()),
             error,
             self.diffuse,
             by_region,

@@ -116,13 +116,14 @@ def plan_scene(
         surface = replace(surface, model=model, parameters=parameters)
     skipped += omissions
     lights = lighting.lights
-    if lights is not None and not subsurface:
+    indirect = subsurface + surface.inter_reflection
+    if lights is not None and not indirect:
         lights, omissions = lights_above_horizon(lights, view)
         skipped += omissions
     if lights is not None and error is not None:
         seen = _with_terms(surface, terms)
         lights, omissions = notable_lights(
-            lights, seen, view, scene, error=error, subsurface=subsurface
+            lights, seen, view, scene, error=error, indirect=indirect
         )
         skipped += omissions
     skipped += (plan_octree(error),) if subsurface else ()
@@ -218,14 +219,15 @@ def notable_lights(
     scene: RayScene,
     *,
     error: float,
-    subsurface: bool = False,
+    indirect: int = 0,
 ) -> tuple[Lights, Omissions]:
     """The lights without the dimmest ones, whose sum may cost a tenth of the wanted relative error.
 
     The light of each is computed at visible points without shadows, which cannot make
     it brighter. The picture is at least as bright as with the shadows at these points.
-    Light under the skin is at most the largest irradiance of any surfel, because its
-    kernel is divided by its sum.
+    Each of the `indirect` kinds of light, under the skin and from other parts of the face, is
+    at most the largest irradiance of any surfel: the kernel under the skin is divided by its
+    sum, and form factors do not exceed 1.
     """
     if len(lights) < 2 or not len(view.pixel):
         return lights, ()
@@ -241,9 +243,9 @@ def notable_lights(
     for i in np.argsort((light**2).sum(axis=(1, 2))) if level > 0 else []:
         total = total + light[i]
         cost = SAFETY * float(np.sqrt(np.mean(total**2))) / level
-        if subsurface:
+        if indirect:
             entered = entered + _irradiance(lights.select(i), surface)
-            cost += float(np.nanmax(entered)) / np.pi / level
+            cost += indirect * float(np.nanmax(entered)) / np.pi / level
         if cost > ERROR_PART * error:
             break
         dropped = [*dropped, int(i)]

@@ -32,11 +32,13 @@ from skindb.render.scene import (
 from skindb.render.shading import (
     TERMS,
     View,
+    bounced_exitance,
     glow_image,
     require_translucency,
     shade_view,
     total_exitance,
     trace_view,
+    transmitted_irradiance,
     tree_opening,
 )
 from skindb.schema.consent import honour_consent
@@ -153,11 +155,11 @@ def picture(shot: Shot) -> NDArray[np.float32]:
     terms = ("surface",) if plan.subsurface else TERMS
     direct = shade_view(shot.view, surface, lamps, shot.scene, terms=terms).sum(axis=0)
     if plan.subsurface:
-        direct += glow_image(
-            shot.view,
-            surface,
-            total_exitance(surface, lamps, shot.scene, receivers=plan.surfels),
-        )
+        glow = total_exitance(surface, lamps, shot.scene, receivers=plan.surfels)
+        if surface.inter_reflection:
+            received = transmitted_irradiance(surface, lamps, shot.scene)
+            glow += bounced_exitance(surface, received @ lamps.intensity)
+        direct += glow_image(shot.view, surface, glow)
     return np.asarray(direct, np.float32)
 
 

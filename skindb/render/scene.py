@@ -5,7 +5,7 @@ records of arrays; subdivision of a surface.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,14 @@ import numpy as np
 import trimesh
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from skindb.errors import Fault, InputError
+from skindb.geometry.interreflection import bounce_transfer
+from skindb.geometry.mesh import vertex_normals
 from skindb.limits import MAX_PICTURE_PIXELS
+from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.kinds import even_diffuse, surface_model
 from skindb.reflectance.model import ReflectanceModel
 from skindb.render.image import read_exr
@@ -48,6 +52,21 @@ class Surface:
     s: Float | None = None  # (v, 3) dipole s, for subsurface transport
     sigma_tr: Float | None = None  # (v, 3) mm^-1, for subsurface transport
     eta: float = 1.3
+    # whether light that other parts reflect with one diffuse bounce is added
+    inter_reflection: bool = False
+
+    @cached_property
+    def transfer(self) -> csr_array:
+        """(v, v) `bounce_transfer` between the vertices, with the normals of the mesh, as in
+        the fit.
+        """
+        return bounce_transfer(
+            self.vertices,
+            vertex_normals(self.vertices, self.faces),
+            self.faces,
+            partial(fresnel_transmittance, eta=self.eta),
+            receivers=np.arange(len(self.vertices)),
+        )
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -208,6 +227,7 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
         if sigma_tr is not None and np.isfinite(sigma_tr).any()
         else None,
         eta=float(fitted[variables.REFRACTIVE_INDEX]),
+        inter_reflection=bool(fitted.get(variables.INTER_REFLECTION, False)),
     )
 
 

@@ -145,6 +145,16 @@ def total_exitance(
     )
 
 
+def bounced_exitance(surface: Surface, received: Float) -> Float:
+    """Radiant exitance (v, 3) under the boundary, R_d E', by light E' that other parts of the
+    surface reflect with one diffuse bounce.
+
+    `received` (v, 3) or (v, 1) is the irradiance under the boundary by the lights.
+    """
+    diffuse = np.nan_to_num(surface.diffuse)
+    return np.asarray(diffuse * (surface.transfer @ (diffuse * received)))
+
+
 def tree_opening(error: float | None) -> tuple[float, float]:
     """Opening of the octree for a picture with this relative error, and the bound on
     its own relative error.
@@ -411,13 +421,16 @@ def shade_view(
         "diffuse" in terms and not subsurface
     )
     points = seen_points(view, surface, diffuse, with_surface="surface" in terms)
-    escape = (
-        escape_factor(view, surface.eta) if subsurface and "diffuse" in terms else None
-    )
-    if escape is not None and glow is None:
+    escape = None
+    if (subsurface or surface.inter_reflection) and "diffuse" in terms:
+        escape = escape_factor(view, surface.eta)
+    if escape is not None and subsurface and glow is None:
         glow = exitances(
             surface, lights, scene, receivers=view.shown(len(surface.vertices))
         )
+    received = np.zeros((len(surface.vertices), len(lights)), np.float32)
+    if escape is not None and surface.inter_reflection:
+        received = transmitted_irradiance(surface, lights, scene)
     images = np.empty(
         (len(lights), view.camera.height, view.camera.width, 3), np.float32
     )
@@ -434,6 +447,9 @@ def shade_view(
         values = shaded * lights.intensity[i]
         if escape is not None and glow is not None:
             values = values + escape * view.interpolate(glow[i])
+        if escape is not None and surface.inter_reflection:
+            bounced = bounced_exitance(surface, received[:, i, None])
+            values += escape * view.interpolate(bounced) * lights.intensity[i]
         images[i] = view.image(values)
     return images
 

@@ -66,6 +66,12 @@ EVEN_REFLECTION_ERROR = declare(
     "standard error of even_reflection, which R_d has in common in all surfels and "
     "channels of the take",
 )
+INTER_REFLECTION = declare(
+    "uint8 fitted/inter_reflection() [1]",
+    "1 if the samples were fitted without light from other parts of the face (one diffuse "
+    "bounce), which pictures therefore add, else 0",
+    uses=Use.SURVIVES_EDIT,
+)
 DIPOLE_S = declare(
     "float32 fitted/dipole_s(surfel, channel) [1]",
     "s = sqrt(3 (1 - alpha')), the inverse of eq. 5",

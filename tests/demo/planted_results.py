@@ -109,7 +109,7 @@ def comparison(light: str, *, held_out: bool, exposure: float = 1.0) -> Comparis
     }
     causes = Causes((0.0, 0.0), 1.0, 1.0, 1.0, 0.0)
     return Comparison(
-        light, "c0", held_out, image, image, mask, error, image, {}, causes
+        light, "c0", held_out, image, image, mask, 0.0, error, image, {}, causes
     )
 
 

@@ -85,7 +85,7 @@ def test_notable_lights__pictures_agree_within_the_bound(
     lights = around(POWERS[name])
     true = whole(surface, lights, subsurface=subsurface)
     for error in (0.5, 0.05, 0.005):
-        kept, omission = planned(surface, lights, error, subsurface=subsurface)
+        kept, omission = planned(surface, lights, error, indirect=subsurface)
         assert omission is not None
         assert omission.skipped == len(lights) - len(kept) > 0
         assert 0 < omission.bound <= 0.1 * error
@@ -112,7 +112,7 @@ def test_notable_lights__equal_lights_are_all_kept(
     error: float, subsurface: bool
 ) -> None:
     lights = around(np.ones(24))
-    kept, omission = planned(skin(), lights, error, subsurface=subsurface)
+    kept, omission = planned(skin(), lights, error, indirect=subsurface)
     assert kept is lights
     assert omission is None
 
