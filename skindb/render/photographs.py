@@ -337,7 +337,8 @@ def compare_photographs(
         require_translucency(surface)
     scene = RayScene(surface.vertices, surface.faces)
     cameras = cameras_from_dome(dome)
-    lights = lights_from_dome(dome)
+    # of the model, as its intensities contain the estimated gains
+    lights = lights_from_dome(model["dome"].to_dataset())
     unseen_lights, unseen_cameras = (_held_out(model, d) for d in ("light", "camera"))
     regions = _regions(capture)
     doubtful = 1 - surfel_confidence(model["fitted"].to_dataset()).astype(np.float64)

@@ -214,6 +214,28 @@ def test_compare_photographs__reads_the_half_floats_of_older_stores(
     assert found[0] == found[1]
 
 
+def test_compare_photographs__contain_the_gains_of_the_model(
+    model: xr.DataTree,
+) -> None:
+    kept = dataset(
+        {
+            "photograph_radiance": np.ones((1, 24, 32, 3)),
+            "photograph_light": [1],
+            "photograph_camera": [0],
+        }
+    )
+    dome = model["dome"].to_dataset()
+    capture = xr.DataTree.from_dict({"photographs": kept, "dome": dome})
+    (plain,) = compare_photographs(model, capture)
+    gain = np.ones((dome.sizes["light"], 1))
+    gain[1] = 1.5
+    model["dome"] = dome.assign(light_intensity=dome["light_intensity"] * gain)
+    (brighter,) = compare_photographs(model, capture)
+    assert plain.rendered.max() > 0
+    # float32
+    np.testing.assert_allclose(brighter.rendered, 1.5 * plain.rendered, rtol=1e-5)
+
+
 def test_compare_photographs__polarisers_scale_the_surface_alone(
     model: xr.DataTree,
 ) -> None:
