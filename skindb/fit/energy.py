@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
+from scipy.special import erfcx
 
 from skindb.fit.lumitexels import POLARISATION, directions
 from skindb.optics.diffusion import dipole_s
@@ -39,6 +40,7 @@ PROPORTIONAL_ERROR = 0.02
 # nearly even lobes, which take the rest: 0.4 to 0.9 in blue in four captures. On 24 others
 # the mean bias of R_d in blue is 0 with it, and 3 % without (docs/validation.md).
 JOINT_FRACTION = 0.5
+SMALLEST_ERROR = 1e-9  # of a prior that is stated to be exact
 # error of what highlights do not show without a prior of the total: highlights of bare
 # skin show the half of it, more or less
 UNKNOWN_ERROR = SURFACE_ENERGY["normal"][0] / 2
@@ -81,6 +83,16 @@ def crossed_gloss(lumitexels: xr.Dataset, eta: float) -> float | None:
     return float(crossed.mean()) if crossed.size else None
 
 
+def _expected_rest(prior: Energy, seen: float) -> float:
+    """Mean of the total minus what was seen, for a normal distribution of the total above
+    it.
+    """
+    error = max(prior.error, SMALLEST_ERROR)
+    deviation = (seen - prior.mean) / error
+    hazard = np.sqrt(2 / np.pi) / erfcx(deviation / np.sqrt(2))  # density over tail
+    return float(prior.mean + error * hazard - seen)
+
+
 def without_even_reflection(
     fitted: xr.Dataset,
     prior: Energy | None,
@@ -100,8 +112,9 @@ def without_even_reflection(
         From `crossed_gloss`; if it is given, R_d contains only this fraction of the even
         reflection, and nothing is subtracted.
     jointly
-        Whether R_d was estimated together with lobes that are nearly even: half is
-        subtracted, as these took the rest from R_d.
+        Whether R_d was estimated together with lobes that are nearly even: half of the
+        mean rest is subtracted, given that the total exceeds what was seen. The lobes
+        took the other half from R_d.
 
     Returns
     -------
@@ -109,8 +122,9 @@ def without_even_reflection(
         With `even_reflection`, the mean of the prior minus the mean
         `surface_reflectance` of the fitted surfels, but at most what the darkest
         surfels reflect in blue, and with the standard deviation of the prior as its
-        error. It is negative if the fitted lobes reflect too much, which R_d then
-        lacks. It is subtracted from R_d, and `dipole_s` follows. Without a prior, or if
+        error. After fits in sequence it is negative if the fitted lobes reflect too much,
+        which R_d then lacks. It is subtracted from R_d, and `dipole_s` follows. Without
+        a prior, or if
         the highlights contradict it, nothing is subtracted. Its error and 0.02 R_d are
         added to the total error of R_d, in quadrature.
     summary
@@ -134,8 +148,10 @@ def without_even_reflection(
         summary |= prior._asdict() | {"contradicted": contradicted}
         if not contradicted:
             largest = float(np.quantile(diffuse[good, 2], DARKEST))
-            fraction = JOINT_FRACTION if jointly else 1.0
-            even = min(fraction * (prior.mean - seen), largest)
+            rest = prior.mean - seen
+            if jointly:
+                rest = JOINT_FRACTION * _expected_rest(prior, seen)
+            even = min(rest, largest)
             error = prior.error
     lower = np.clip(diffuse - even, SMALLEST_R_D, LARGEST_R_D)
     parts = (

@@ -106,6 +106,19 @@ def test_without_even_reflection__lobes_that_reflect_too_much_return_it(diffuse)
     np.testing.assert_allclose(fitted["diffuse_reflectance"], diffuse, atol=1e-5)
 
 
+@pytest.mark.parametrize("mean", [0.015, 0.02, 0.04])
+def test_without_even_reflection__joint_fits_show_less_than_the_total(diffuse, mean):
+    """Half the mean rest of totals that are drawn from the prior and exceed the highlights."""
+    totals = np.random.default_rng(5).normal(mean, 0.012, 400_000)
+    rest = (totals[totals > HIGHLIGHTS] - HIGHLIGHTS) / 2
+    prior = Energy(mean, 0.012)
+    fitted, summary = without_even_reflection(_planted(diffuse), prior, jointly=True)
+    assert not summary["contradicted"]
+    # five standard errors of the mean of the draws
+    error = 5 * rest.std() / np.sqrt(rest.size)
+    assert fitted["even_reflection"] == pytest.approx(rest.mean(), abs=error)
+
+
 def test_without_even_reflection__lobes_of_a_joint_fit_took_half_of_it(diffuse):
     fitted, _ = without_even_reflection(_planted(diffuse), KNOWN, jointly=True)
     np.testing.assert_allclose(fitted["even_reflection"], 0.015 / 2, atol=1e-5)
