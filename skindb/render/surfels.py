@@ -9,6 +9,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from skindb.errors import Fault, InputError
+from skindb.geometry.interreflection import tangent_frames
 from skindb.reflectance.kinds import even_diffuse, surface_model
 from skindb.reflectance.model import Lamp, Points, ReflectanceModel
 from skindb.render.scene import usable_surfels
@@ -246,7 +247,9 @@ def reflectance_errors(
         fitted[variables.FIT_RESIDUAL].values[:, None] * total,
         shown - measured,
     )
-    return np.asarray(np.sqrt(sum(part**2 for part in parts)))
+    error = np.sqrt(sum(part**2 for part in parts))
+    # a turned pair may be above the horizon where the given one is not
+    return np.where(through > 0, error, 0.0)
 
 
 def _to_measured(
@@ -260,7 +263,7 @@ def _to_measured(
     axis = np.cross(normal, half)
     sine = np.linalg.norm(axis, axis=1, keepdims=True)
     across = to_light - to_camera
-    tangent = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
+    tangent = tangent_frames(normal)[:, 0]
     flat = np.linalg.norm(across, axis=1, keepdims=True) < 1e-6
     axis = np.where(sine > 1e-6, axis, np.where(flat, tangent, across))
     axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-12)

@@ -199,6 +199,14 @@ def test_evaluate_error__is_the_sum_of_its_parts(with_errors, theta_h):
     assert extrapolated.any() == (theta_h < SEEN)
 
 
+def test_evaluate_error__is_zero_below_the_horizon(with_errors):
+    normal = _unit(with_errors["fitted/shading_normal"].values[1].astype(float))
+    wi, wo = _at_half_angle(normal, np.radians(5.0))
+    grazing = _unit(wo - (wo @ normal)[:, None] * normal - 0.02 * normal)
+    assert (evaluate_error(with_errors, 1, wi, wo) > 0).all()
+    assert (evaluate_error(with_errors, 1, wi, grazing) == 0).all()
+
+
 def test_evaluate_error__refuses_a_model_without_errors(model):
     with pytest.raises(InputError, match="diffuse_reflectance_total_error"):
         evaluate_error(model, 1, [0, 0, 1], [0, 0, 1])
