@@ -24,8 +24,7 @@ from skindb.numerics.statistics import CONFIDENCE, ROUNDING
 from skindb.types import Array, Index, Mask, float64
 
 Draw = NDArray[Any]  # an order, signs or labels of the subjects, or many of them
-SUMS = 2  # entries per draw and quantity when products of matrices are used
-MANY = 1000  # number of quantities from which products of matrices are faster
+SUMS = 8  # values in memory per draw and quantity, or subject
 # relative to the sum of weighted squares; smaller differences are dominated by rounding
 CANCELLED = 1e-6
 BATCH = 1 << 22  # number of permuted values in memory at a time: 32 MB
@@ -86,12 +85,10 @@ class _Regression:
     def permuted_statistics(self, order: Index, sign: Array) -> Array:
         """Statistics (b, q) of values in another order (b, rows), multiplied by signs (b, rows).
 
-        Sums over subjects are products of matrices. For many quantities, the factors
-        are permuted b times instead of the values. Statistics whose residuals are
-        mostly rounding are computed again from the permuted values.
+        Sums over subjects are products of matrices, whose factors are permuted instead
+        of the values. Statistics whose residuals are mostly rounding are computed again
+        from the permuted values.
         """
-        if len(self.columns) < MANY:
-            return self.statistics(self.values[order] * sign[..., None])
         weight = self.error_weight
         # orthogonal columns, all but the last of unit length
         design = np.column_stack([self.basis, self.regressor])
@@ -366,8 +363,7 @@ def _max_t_p(
     threshold = observed * REACHED
     alone = np.zeros(shape[1])
     family = np.zeros(shape[1])
-    entries = shape[1] * (shape[0] if shape[1] < MANY else SUMS)
-    for batch in _batches(draws, entries):
+    for batch in _batches(draws, SUMS * sum(shape)):
         largest = np.zeros(len(batch))
         for fit in fits:
             statistics = np.abs(fit.permuted_statistics(*redraw(fit, batch)))
