@@ -14,8 +14,9 @@ monotone.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from math import factorial, pi, sqrt
 from typing import Any
@@ -23,8 +24,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import fftfreq, irfft2, rfft2, rfftfreq
-from scipy.ndimage import uniform_filter
 from scipy.optimize import isotonic_regression
+from scipy.sparse import csr_array
 
 from skindb.types import Array, Float64, Mask, float64
 
@@ -32,6 +33,7 @@ Image = Array
 Spectrum = NDArray[np.complexfloating[Any, Any]]
 LEVELS = 7
 ORIENTATIONS = 4
+MAX_SHAPES = LEVELS + 1  # whose masks are kept: 25 MB for images of 1024 x 1024
 QUANTILES = 256  # entries of a quantile function
 # values; a quantile of this many is accurate to 0.14 % of all ranks, a third of a level
 MAX_SORTED = 1 << 17
@@ -104,7 +106,7 @@ def build(
         )
     spectrum = _transform(image)
     shape = image.shape
-    kind = image.dtype.type
+    kind: Any = image.dtype.type
     low, high = _low(shape, shape, 0, kind)
     residual = _image(spectrum * high, shape)
     bands = []
@@ -125,7 +127,7 @@ def reconstruct(pyramid: Pyramid) -> Image:
     of the decomposition.
     """
     shape = pyramid.high.shape
-    kind = pyramid.high.dtype.type
+    kind: Any = pyramid.high.dtype.type
     spectrum = _transform(pyramid.low)
     for level in reversed(range(len(pyramid.bands))):
         bands = pyramid.bands[level]
@@ -152,6 +154,7 @@ def _frequencies(
     return rows[:, None].astype(kind), columns[None].astype(kind)
 
 
+@lru_cache(MAX_SHAPES)
 def _low(
     size: tuple[int, ...], shape: tuple[int, ...], level: int, kind: Any
 ) -> tuple[Image, Image]:
@@ -172,9 +175,10 @@ def _low(
     return low, high
 
 
+@lru_cache(MAX_SHAPES)
 def _angular(
     size: tuple[int, ...], shape: tuple[int, ...], orientations: int, kind: Any
-) -> Iterator[Image]:
+) -> list[Image]:
     """Oriented masks, powers of the cosine of the angle to each direction, whose
     squares add up to 1.
     """
@@ -184,12 +188,14 @@ def _angular(
     inverse = rows * rows + columns * columns
     inverse.flat[0] = 1  # frequency 0 has no direction; the other masks are 0 there
     inverse = 1 / np.sqrt(inverse)
+    masks = []
     for angle in pi * np.arange(orientations) / orientations:
         along = (columns * kind(np.cos(angle)) + rows * kind(np.sin(angle))) * inverse
         mask = np.full_like(along, scale)
         for _ in range(order):
             mask *= along
-        yield mask
+        masks.append(mask)
+    return masks
 
 
 def _phase(orientations: int, kind: Any) -> Any:
@@ -268,18 +274,25 @@ def level_fractions(mask: Image, shapes: Sequence[tuple[int, ...]]) -> list[Imag
         of the whole image.
     """
     mask = np.asarray(mask, np.float32)
-    fractions: dict[tuple[int, ...], Image] = {mask.shape: mask}
-    for shape in shapes:
-        if shape not in fractions:
-            sides = list(zip(mask.shape, shape, strict=True))
-            width = [max(1, round(n / m)) for n, m in sides]
-            near = uniform_filter(mask, width, mode="nearest")
-            rows, columns = (
-                np.minimum(np.round(np.arange(m) * n / m), n - 1).astype(int)
-                for n, m in sides
-            )
-            fractions[shape] = near[np.ix_(rows, columns)]
+    fractions = {
+        shape: _averages(mask.shape[1], shape[1])
+        .dot(_averages(mask.shape[0], shape[0]).dot(mask).T)
+        .T
+        for shape in {*shapes}
+    }
     return [fractions[shape] for shape in shapes]
+
+
+@lru_cache(2 * MAX_SHAPES)
+def _averages(size: int, count: int) -> csr_array:
+    """Matrix (count, size) that averages the neighbourhoods of `count` of `size` entries."""
+    width = max(1, round(size / count))
+    centres = np.minimum(np.round(np.arange(count) * size / count), size - 1)
+    near = centres[:, None] + np.arange(width) - width // 2
+    columns = np.clip(near, 0, size - 1).astype(int).ravel()
+    rows = np.repeat(np.arange(count), width)
+    weights = np.full(len(rows), 1 / width, np.float32)
+    return csr_array((weights, (rows, columns)), shape=(count, size))
 
 
 def members(fraction: Image) -> Mask:
