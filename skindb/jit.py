@@ -9,13 +9,10 @@ vector code does not compile. The fit then takes about four times the CPU time.
 
 from __future__ import annotations
 
-import hashlib
 import math
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numba as nb
@@ -26,6 +23,7 @@ from numba.core import cgutils, event
 from numba.extending import intrinsic, overload
 from numpy.typing import NDArray
 
+from skindb.kernel_cache import KernelFiles
 from skindb.types import Integer, IntVector32, Matrix32, Real, Vector32
 
 # a kernel keeps its signature for mypy, which checks its callers
@@ -42,7 +40,7 @@ INTRINSICS = os.environ.get("SKINDB_INTRINSICS", "1") != "0"
 
 def kernel(function: Function) -> Function:
     """Compile a kernel whose sums keep their order."""
-    return _stamped(nb.njit(**OPTIONS)(function))
+    return _stored(nb.njit(**OPTIONS)(function))
 
 
 def fast_kernel(function: Function) -> Function:
@@ -52,40 +50,23 @@ def fast_kernel(function: Function) -> Function:
     compiled both would call the separately compiled copy, and a process that reads them
     from the disk the copy next to the caller, which may sum in another order.
     """
-    return _stamped(nb.njit(fastmath=FAST, forceinline=True, **OPTIONS)(function))
+    return _stored(nb.njit(fastmath=FAST, forceinline=True, **OPTIONS)(function))
 
 
 def inline_kernel(function: Function) -> Function:
     """Like `kernel`, but inlined by Numba into each of its callers."""
-    return _stamped(nb.njit(inline="always", **OPTIONS)(function))
+    return _stored(nb.njit(inline="always", **OPTIONS)(function))
 
 
 def inline_fast_kernel(function: Function) -> Function:
     """Like `fast_kernel`, but inlined by Numba into each of its callers."""
-    return _stamped(nb.njit(fastmath=FAST, inline="always", **OPTIONS)(function))
+    return _stored(nb.njit(fastmath=FAST, inline="always", **OPTIONS)(function))
 
 
-def _stamped(compiled: Any) -> Any:
-    """Make the cache on disk valid only as long as no kernel changes.
-
-    Numba only compares the date of the file of a function. Compiled code also contains
-    the functions of other files that it calls, which would not be updated. The version
-    is compared before names of modules, which may be gone, are read from the cache.
-    """
-    cache_file = compiled._cache._cache_file
-    cache_file._source_stamp = _sources()
-    cache_file._version = _sources()
+def _stored(compiled: Any) -> Any:
+    """Keep the compiled code on disk as long as nothing that it contains changes."""
+    compiled._cache._cache_file = KernelFiles(compiled)
     return compiled
-
-
-@cache
-def _sources() -> str:
-    """Digest of the version of Numba and of the source of all modules with compiled code."""
-    root = Path(__file__).parent
-    digest = hashlib.sha256(f"{nb.__version__} {INTRINSICS}".encode())
-    for path in [root / "jit.py", *sorted(root.rglob("_*_kernels.py"))]:
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
 
 
 @contextmanager

@@ -2,70 +2,152 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
+from types import FunctionType
 
 import pytest
 
 import skindb.jit
+from skindb.kernel_cache import digest
 
-CALL = "from package._outer_kernels import outer; print(outer(1.0))"
-INNER = "from package.jit import kernel\n\n@kernel\ndef inner(x):\n    return x + {}\n"
-OUTER = "from package.jit import kernel\nfrom package._inner_kernels import inner\n\n"
-OUTER += "@kernel\ndef outer(x):\n    return 10 * inner(x)\n"
+CALL = """
+from package.jit import reported_compilation
+from package._outer_kernels import outer
+calls = []
+with reported_compilation(lambda: calls.append(1)):
+    print(outer(1.0), len(calls))
+"""
+INNER = """{comment}from package.jit import kernel
+
+STEP = {step}
+
+@kernel
+def other(x):
+    return x - {other}
+
+@kernel
+def inner(x):
+    return x + STEP
+"""
+OUTER = """from package.jit import kernel
+from package._inner_kernels import inner
+
+@kernel
+def outer(x):
+    return 10 * inner(x)
+"""
 
 
-@pytest.mark.slow
-def test_kernel__is_compiled_again_when_a_kernel_of_another_file_changes(tmp_path):
-    package = tmp_path / "package"
+def _package(folder: Path, **modules: str) -> Path:
+    """A package with modules and our decorators."""
+    package = folder / "package"
     package.mkdir()
     (package / "__init__.py").write_text("")
     (package / "jit.py").write_bytes(Path(skindb.jit.__file__).read_bytes())
-    (package / "_outer_kernels.py").write_text(OUTER)
-
-    def printed() -> str:
-        done = subprocess.run(
-            [sys.executable, "-c", CALL],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        return done.stdout.strip()
-
-    for step, expected in (("1", "20.0"), ("1", "20.0"), ("4", "50.0")):
-        (package / "_inner_kernels.py").write_text(INNER.format(step))
-        assert printed() == expected
-    assert list(package.glob("__pycache__/*.nbc"))  # the cache is used
+    for name, text in modules.items():
+        (package / f"{name}.py").write_text(text)
+    return package
 
 
-PAIR = "from typing import NamedTuple\n\nclass Pair(NamedTuple):\n    a: float\n    b: float\n"
-SUM = "from package.jit import kernel\n\n@kernel\ndef outer(pair):\n    return pair.a + pair.b\n"
-CALL_PAIR = "from package._outer_kernels import outer; from package.{} import Pair; "
-CALL_PAIR += "print(outer(Pair(1.0, 2.0)))"
+def _printed(code: str, folder: Path, **environment: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=folder,
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return done.stdout.strip()
 
 
 @pytest.mark.slow
-def test_kernel__is_compiled_again_when_the_module_of_an_argument_is_renamed(tmp_path):
-    """The cache names the classes of arguments by their modules."""
-    package = tmp_path / "package"
-    package.mkdir()
-    (package / "__init__.py").write_text("")
-    (package / "jit.py").write_bytes(Path(skindb.jit.__file__).read_bytes())
-    (package / "_outer_kernels.py").write_text(SUM)
-    (package / "_pair_kernels.py").write_text(PAIR)
-    for name in ("_pair_kernels", "_couple_kernels"):
-        if not (package / f"{name}.py").exists():
-            (package / "_pair_kernels.py").rename(package / f"{name}.py")
-        done = subprocess.run(
-            [sys.executable, "-c", CALL_PAIR.format(name)],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.stdout == "3.0\n", done.stderr
+def test_kernel__is_compiled_again_only_when_what_it_calls_changes(tmp_path):
+    package = _package(tmp_path, _outer_kernels=OUTER)
+    for values, expected in (
+        ({"step": 1}, "20.0 2"),
+        ({"step": 1}, "20.0 0"),
+        ({"step": 1, "other": 4, "comment": "# moves the lines\n\n"}, "20.0 0"),
+        ({"step": 4, "other": 4}, "50.0 2"),
+    ):
+        text = INNER.format(**{"other": 2, "comment": ""} | values)
+        (package / "_inner_kernels.py").write_text(text)
+        assert _printed(CALL, tmp_path) == expected
+    # what was compiled from older code is removed
+    assert len(list(package.glob("__pycache__/*.nbc"))) == 2
+
+
+def test_kernel__without_its_stored_code_is_compiled_again(tmp_path):
+    package = _package(
+        tmp_path, _outer_kernels=INNER.format(step=1, other=2, comment="")
+    )
+    call = CALL.replace("outer(", "inner(").replace("import outer", "import inner")
+    assert _printed(call, tmp_path) == "2.0 1"
+    (stored,) = package.glob("__pycache__/*.nbc")
+    stored.write_bytes(stored.read_bytes()[:100])
+    assert _printed(call, tmp_path) == "2.0 1"
+    assert _printed(call, tmp_path) == "2.0 0"
+
+
+DIGESTS = """
+import importlib
+from numba.core.registry import CPUDispatcher
+from skindb.kernel_cache import digest
+for name in {}:
+    for key, one in vars(importlib.import_module(name)).items():
+        if isinstance(one, CPUDispatcher):
+            print(name, key, digest(one))
+"""
+
+
+def test_digest__of_every_kernel_is_the_same_in_each_process():
+    """Otherwise every process would compile it."""
+    root = Path(skindb.__file__).parent
+    paths = [path.relative_to(root.parent) for path in root.rglob("_*_kernels.py")]
+    names = [str(path.with_suffix("")).replace("/", ".") for path in paths]
+    code = DIGESTS.format(names)
+    printed = [_printed(code, root.parent, PYTHONHASHSEED=seed) for seed in "12"]
+    assert len(printed[0].splitlines()) > 200
+    assert printed[0] == printed[1]
+
+
+@pytest.mark.parametrize("value", [object(), skindb.jit])
+def test_digest__refuses_what_it_cannot_compare(value):
+    code = compile("value", "kernel", "eval")
+    with pytest.raises(TypeError, match="a kernel cannot use"):
+        digest(FunctionType(code, {"value": value, "__name__": "package"}))
+
+
+PAIR = """from typing import NamedTuple
+
+class Pair(NamedTuple):
+    {}: float
+    {}: float
+"""
+TENFOLD = """from package.jit import kernel
+
+@kernel
+def outer(pair):
+    return 10 * pair.a + pair.b
+"""
+
+
+@pytest.mark.slow
+def test_kernel__is_compiled_again_when_the_class_of_an_argument_changes(tmp_path):
+    """Compiled code has the positions of the fields, and the name of the module."""
+    package = _package(tmp_path, _outer_kernels=TENFOLD)
+    for module, fields, expected in (
+        ("first", "ab", "12.0"),
+        ("first", "ba", "21.0"),
+        ("second", "ba", "21.0"),
+    ):
+        (package / "first.py").unlink(missing_ok=True)
+        (package / f"{module}.py").write_text(PAIR.format(*fields))
+        code = f"from package._outer_kernels import outer; from package.{module} import Pair\n"
+        assert _printed(code + "print(outer(Pair(1.0, 2.0)))", tmp_path) == expected
 
 
 IMPORTED = (
@@ -94,10 +176,8 @@ kernels = [one for module in map(sys.modules.get, names)
            for one in vars(module).values() if isinstance(one, CPUDispatcher)]
 print(len(calls), sum(len(one.signatures) for one in kernels), len(kernels) > 50)
 """
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.split() == ["0", "0", "True"]
+    root = Path(skindb.__file__).parent.parent
+    assert _printed(code, root).split() == ["0", "0", "True"]
 
 
 FIT = """
@@ -114,19 +194,12 @@ print(hashlib.sha256(found.parameters.tobytes()).hexdigest())
 
 
 @pytest.mark.slow
-def test_fast_kernel__the_same_bits_just_compiled_and_read_from_the_disk(
-    tmp_path, monkeypatch
-):
+def test_fast_kernel__the_same_bits_just_compiled_and_read_from_the_disk(tmp_path):
     """The first worker after an installation compiles, and its results must equal those
     of the others.
     """
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    printed = [
-        subprocess.run(
-            [sys.executable, "-c", FIT], capture_output=True, text=True, check=True
-        ).stdout
-        for _ in "12"
-    ]
-    assert len(printed[0].strip()) == 64
+    root = Path(skindb.__file__).parent.parent
+    printed = [_printed(FIT, root, NUMBA_CACHE_DIR=str(tmp_path)) for _ in "12"]
+    assert len(printed[0]) == 64
     assert printed[0] == printed[1]
     assert list(tmp_path.rglob("*.nbc"))
