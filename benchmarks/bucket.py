@@ -20,8 +20,8 @@ from bucket_server import new_bucket, s3_server, settings
 from faulty_proxy import faulty_proxy
 
 from skindb.schema import dataset
+from skindb.schema.label import BLOCK_SURFELS
 from skindb.store import Database
-from skindb.store.stage import SHARD
 
 LIGHTS = 150
 CAMERAS = 16
@@ -52,14 +52,16 @@ def steps(url: str, values: np.ndarray):
     yield "read all", clock() - begin
     begin = clock()
     samples = Database(url).read("capture", "A1")[NAME]
-    samples[:: SHARD // 2, :3].compute()
+    samples[:: BLOCK_SURFELS // 2, :3].compute()
     yield "read two chunks of every shard", clock() - begin
     begin = clock()
     assert Database(url).verify() == []
     yield "verify", clock() - begin
 
 
-def main(*, surfels: int = 5 * SHARD, repeat: int = 3, delay_ms: float = 20.0) -> None:
+def main(
+    *, surfels: int = 5 * BLOCK_SURFELS, repeat: int = 3, delay_ms: float = 20.0
+) -> None:
     """Measure and print."""
     values = samples(surfels)
     times: dict[tuple[str, str], list[float]] = {}

@@ -59,26 +59,26 @@ def write_checksums(root: Path, values: np.ndarray) -> Path:
         filters=layout["filters"],
         compressors=[*layout["compressors"], Crc32cCodec()],
     )
-    for start in range(0, len(values), stage_module.SHARD):
-        array[start : start + stage_module.SHARD] = values[
-            start : start + stage_module.SHARD
+    for start in range(0, len(values), stage_module.BLOCK_SURFELS):
+        array[start : start + stage_module.BLOCK_SURFELS] = values[
+            start : start + stage_module.BLOCK_SURFELS
         ]
     return root
 
 
 def whole(array: zarr.Array) -> None:
     """Read every shard."""
-    for start in range(0, array.shape[0], stage_module.SHARD):
-        array[start : start + stage_module.SHARD]
+    for start in range(0, array.shape[0], stage_module.BLOCK_SURFELS):
+        array[start : start + stage_module.BLOCK_SURFELS]
 
 
 def part(array: zarr.Array) -> None:
     """Read one chunk of every second shard, like a small sample of a face."""
-    for start in range(0, array.shape[0], 2 * stage_module.SHARD):
+    for start in range(0, array.shape[0], 2 * stage_module.BLOCK_SURFELS):
         array[start + 2 * CHUNK : start + 3 * CHUNK]
 
 
-def main(*, surfels: int = 5 * stage_module.SHARD, repeat: int = 5) -> None:
+def main(*, surfels: int = 5 * stage_module.BLOCK_SURFELS, repeat: int = 5) -> None:
     """Measure and print."""
     zarr.config.set({"array.order": "F"})
     with tempfile.TemporaryDirectory() as folder:

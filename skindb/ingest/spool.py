@@ -28,7 +28,7 @@ from skindb.errors import Fault, InputError
 from skindb.files import PRIVATE_FILE, make_private, private_file
 from skindb.ingest._sample_kernels import tally
 from skindb.limits import RESUMABLE_SECONDS
-from skindb.schema.label import SHARD
+from skindb.schema.label import BLOCK_SURFELS
 
 # between two entries of the journal: the most that a killed run loses
 JOURNAL_INTERVAL_SECONDS = 5.0
@@ -170,7 +170,9 @@ class Spool:
     def samples(self) -> da.Array:
         """Samples (n, light, camera, 3), read lazily in the shards of the store."""
         lights, cameras, n = self.shape
-        sizes = tuple(min(SHARD, n - start) for start in range(0, n, SHARD))
+        sizes = tuple(
+            min(BLOCK_SURFELS, n - start) for start in range(0, n, BLOCK_SURFELS)
+        )
 
         def shard(block_info: Any = None) -> NDArray[np.float16]:
             (begin, end), *_ = block_info[None]["array-location"]

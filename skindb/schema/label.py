@@ -12,7 +12,7 @@ from skindb.errors import Fault, InputError
 from skindb.schema.declaration import flag_attrs
 from skindb.schema.variables import VARIABLES
 
-SHARD = 4096  # surfels of a block: one task writes one file
+BLOCK_SURFELS = 4096  # of a task of a fit; objects hold multiples of it
 FACE = "face"  # every surfel of a take
 # attributes of a capture that its models and their edits have too
 TAKE_ATTRS = ("subject", "condition", "session", "traits", "consent_scope", "take")

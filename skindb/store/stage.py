@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import uuid
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -15,12 +16,14 @@ import numpy as np
 import xarray as xr
 import zarr
 from zarr.codecs import BloscCodec, TransposeCodec
+from zarr.core.buffer import default_buffer_prototype
+from zarr.core.sync import sync
 
 from skindb import __version__
 from skindb.errors import Fault, InputError, add_filename, input_error
 from skindb.files import plain
 from skindb.schema import SCHEMA_VERSION, VARIABLES, check, dataset
-from skindb.schema.label import SHARD
+from skindb.schema.label import BLOCK_SURFELS
 from skindb.store.inputs import (
     names_of,
     require_consents,
@@ -54,6 +57,9 @@ MIN_CHUNK_BYTES = 1 << 19  # a smaller chunk gets more surfels
 # level 2 with the default block size of Blosc takes 1.7 times as long to write, 1.4
 # times to read, and 6 % more space
 CODEC = BloscCodec(cname="zstd", clevel=1, shuffle="shuffle", blocksize=1 << 20)
+# of an object before compression, except that it has at least a block of surfels: the
+# samples of 16 cameras x 150 lights have 59 MB a block, and 16 MB compressed
+MAX_OBJECT_BYTES = 1 << 24
 MAX_UNSHARDED_BYTES = 1 << 26  # larger arrays are written shard by shard
 TABLES = "tables"
 NAMES = "names"  # file beside a version with the takes that it refers to
@@ -114,6 +120,7 @@ class Stage:
         self._is_declared = kind in KINDS_OF_ONE_SUBJECT
         self.contents: dict[str, Any] = {}
         self.groups: set[str] = set()
+        self._nodes: set[str] = set()  # groups, and their arrays
         self.tables: xr.Dataset | None = None
 
     def __enter__(self) -> Self:
@@ -172,6 +179,7 @@ class Stage:
         self.contents |= {name: describe(ds) for name, ds in datasets.items()}
         self.groups |= groups.keys()
         for name, ds in groups.items():
+            self._nodes |= {name, *(f"{name}/{variable}" for variable in ds.variables)}
             ready = _whole_shards(ds).assign_attrs(plain(ds.attrs))
             encoding = {str(v): _encoding(ready[v]) for v in ready.variables}
             # write_empty_chunks: the search for empty chunks would take as long as
@@ -191,28 +199,6 @@ class Stage:
                         zarr_format=3,
                         consolidated=False,
                     )
-
-    def put(
-        self, group: str, name: str, start: int, values: np.ndarray[Any, Any]
-    ) -> None:
-        """Write whole shards of a variable that `write` has created, from surfel `start`."""
-        self._require_open()
-        with add_filename(self.place.where(self.path)):
-            self._put(group, name, start, values)
-
-    def _put(
-        self, group: str, name: str, start: int, values: np.ndarray[Any, Any]
-    ) -> None:
-        array = zarr.open_array(
-            self.place.writable(self.path), path=f"{group}/{name}", mode="r+"
-        )
-        if start % SHARD or (
-            len(values) % SHARD and start + len(values) != array.shape[0]
-        ):
-            raise ValueError(
-                f"must be whole shards of {SHARD} surfels; found {len(values)} surfels from {start}"
-            )
-        array[start : start + len(values)] = values
 
     def commit(self, provenance: Mapping[str, Any]) -> Record:
         """Make the version durable and current.
@@ -238,9 +224,7 @@ class Stage:
             **plain(dict(provenance)),
         }
         with add_filename(self.place.where(self.path)):
-            zarr.open_group(self.place.writable(self.path), mode="a").attrs.update(
-                attrs
-            )
+            self._write_root(attrs)
             # the data first, then the record; transient results need not survive a power loss
             self.place.make_durable(self.path, flush=self.log.kind not in TRANSIENT)
         files = self._written_files()
@@ -270,6 +254,28 @@ class Stage:
         )
         self.committed = True
         return record
+
+    def _write_root(self, attrs: Mapping[str, Any]) -> None:
+        """Write the metadata of the root with those of all nodes, so that other programs
+        open a version by one file; `zarr.consolidate_metadata` would warn about format 3.
+        """
+        nodes = {}
+        for node in sorted(self._nodes, key=lambda name: (name.count("/"), name)):
+            with suppress(FileNotFoundError):  # `_written_files` reports it
+                content = self.place.read(f"{self.path}/{node}/zarr.json")
+                nodes[node] = json.loads(content)
+        root = {
+            "zarr_format": 3,
+            "node_type": "group",
+            "attributes": attrs,
+            "consolidated_metadata": {
+                "kind": "inline",
+                "must_understand": False,
+                "metadata": nodes,
+            },
+        }
+        buffer = default_buffer_prototype().buffer.from_bytes(json.dumps(root).encode())
+        sync(self.place.writable(self.path).set("zarr.json", buffer))
 
     def _written_files(self) -> Manifest:
         """Digest and size of every file, with those of all groups that were written."""
@@ -453,23 +459,24 @@ def _whole_shards(ds: xr.Dataset) -> xr.Dataset:
     ds = ds.copy()
     for name, variable in ds.variables.items():
         variable.encoding.clear()
+        rows = _object_rows(variable)
         if variable.chunks is not None:
-            sizes = {dim: SHARD if dim == "surfel" else -1 for dim in variable.dims}
-            ds[name] = ds[name].chunk(sizes)
+            first = dict.fromkeys(variable.dims[:1], rows)
+            ds[name] = ds[name].chunk(dict.fromkeys(variable.dims, -1) | first)
         elif variable.dims[:1] == ("surfel",) and variable.nbytes > MAX_UNSHARDED_BYTES:
-            ds[name] = variable.copy(data=_shards(variable.values))
+            ds[name] = variable.copy(data=_shards(variable.values, rows))
         elif variable.dtype.kind in "UO":
             # zarr v3 specifies StringDType, but not fixed-width text
             ds[name] = ds[name].astype(np.dtypes.StringDType())
     return ds
 
 
-def _shards(values: np.ndarray[Any, Any]) -> Any:
+def _shards(values: np.ndarray[Any, Any], rows: int) -> Any:
     """An array as lazy shards; `dask.array.from_array` would copy a memory-mapped file
     into memory.
     """
-    starts = range(0, len(values), SHARD)
-    sizes = tuple(len(values[start : start + SHARD]) for start in starts)
+    starts = range(0, len(values), rows)
+    sizes = tuple(len(values[start : start + rows]) for start in starts)
 
     def shard(block_info: Any = None) -> np.ndarray[Any, Any]:
         (begin, end), *_ = block_info[None]["array-location"]
@@ -482,22 +489,34 @@ def _shards(values: np.ndarray[Any, Any]) -> Any:
     )
 
 
+def _row_bytes(array: xr.DataArray | xr.Variable) -> int:
+    return int(array.dtype.itemsize * math.prod(array.shape[1:]))
+
+
+def _object_rows(array: xr.DataArray | xr.Variable) -> int:
+    """Elements along the first dim in one object; whole blocks of surfels."""
+    rows = MAX_OBJECT_BYTES // max(_row_bytes(array), 1)
+    if array.dims[:1] == ("surfel",):
+        return max(rows // BLOCK_SURFELS, 1) * BLOCK_SURFELS
+    return max(rows, 1)
+
+
 def _encoding(array: xr.DataArray) -> dict[str, Any]:
     if array.dtype.kind not in "fiub" or array.ndim == 0 or array.size == 0:
         return {}
+    length, *rest = array.shape
+    rows = _object_rows(array)
     # no fill value, which a reader would mask; missing values are NaN or have a status
     plain: dict[str, Any] = {"compressors": [CODEC], "_FillValue": None}
     if array.dims[0] != "surfel":
-        return plain
-    rest = array.shape[1:]
+        return plain | {"chunks": (min(rows, length), *rest)}
     # reading a chunk takes at least a millisecond, whatever its size
-    row = array.dtype.itemsize * int(np.prod(rest))
     chunk = MIN_CHUNK_SURFELS
-    while chunk < SHARD and chunk * row < MIN_CHUNK_BYTES:
+    while chunk < BLOCK_SURFELS and chunk * _row_bytes(array) < MIN_CHUNK_BYTES:
         chunk *= 2
     # a shard is allocated in full, so that of a small take is no larger than the array
-    chunk = min(chunk, array.shape[0])
-    shard = min(SHARD, -(-array.shape[0] // chunk) * chunk)
+    chunk = min(chunk, length)
+    shard = min(rows, -(-length // chunk) * chunk)
     plain |= {"chunks": (chunk, *rest), "shards": (shard, *rest)}
     # samples compress best with neighbouring surfels next to each other
     if array.ndim == 4:

@@ -23,7 +23,7 @@ from zarr.abc.store import (
 from zarr.core.buffer import Buffer, BufferPrototype
 
 from skindb.errors import Fault, InputError, input_error
-from skindb.schema.label import SHARD
+from skindb.schema.label import BLOCK_SURFELS
 from skindb.store.place import Place
 from skindb.store.record import Record, json_object
 
@@ -266,7 +266,9 @@ class VerifiedStore(ListedStore):
 
 
 def open_version(place: Place, record: Record) -> xr.DataTree:
-    """A version as a lazy DataTree, in blocks of 4,096 surfels."""
+    """A version as a lazy DataTree, in blocks of 4,096 surfels where it has samples, and
+    of whole objects elsewhere.
+    """
     store = VerifiedStore(place, record)
     # chunks={} would use the inner chunks, which gives sixteen times as many tasks
     tree = xr.open_datatree(store, engine="zarr", consolidated=False, chunks=None)  # type: ignore[arg-type]
@@ -283,7 +285,13 @@ def open_group(place: Place, record: Record, group: str) -> xr.Dataset:
 
 
 def _chunked(ds: xr.Dataset) -> xr.Dataset:
-    return ds.chunk(surfel=SHARD) if "surfel" in ds.dims else ds
+    if "surfel" not in ds.dims:
+        return ds
+    shards = [variable.encoding.get("shards") for variable in ds.variables.values()]
+    rows = min((shard[0] for shard in shards if shard), default=BLOCK_SURFELS)
+    if any(variable.ndim > 3 for variable in ds.data_vars.values()):
+        rows = BLOCK_SURFELS  # samples, from which long computations are made
+    return ds.chunk(surfel=rows)
 
 
 def limits(byte_range: Any) -> tuple[int, int | None]:

@@ -19,8 +19,8 @@ from skindb.errors import InputError
 from skindb.ingest import IngestParameters, ingest_capture, lumitexels, read_capture
 from skindb.ingest._sample_kernels import NONE
 from skindb.ingest.spool import STALE_SECONDS, Spool, remove_stale
+from skindb.schema.label import BLOCK_SURFELS
 from skindb.store import Database
-from skindb.store.stage import SHARD
 from skindb.workflow import ingest_take
 
 FRAMES = {"a": [1, 2]}
@@ -46,11 +46,11 @@ def put_all(target, rng):
 
 
 def test_spool__gives_back_what_was_put_by_shards(tmp_path):
-    n = 2 * SHARD + 17
+    n = 2 * BLOCK_SURFELS + 17
     with Spool(tmp_path / "a", (3, 2, n), FRAMES, key="run") as target:
         content = put_all(target, np.random.default_rng(1))
         lazy = target.samples()
-        assert lazy.chunks[0] == (SHARD, SHARD, 17)
+        assert lazy.chunks[0] == (BLOCK_SURFELS, BLOCK_SURFELS, 17)
         np.testing.assert_array_equal(
             lazy.compute().view(np.uint16), np.moveaxis(content, -1, 0)
         )

@@ -25,14 +25,15 @@ from waiting import PATIENCE_SECONDS
 import skindb
 from skindb.errors import InputError
 from skindb.schema import dataset
+from skindb.schema.label import BLOCK_SURFELS
 from skindb.store import Conflict, Database, s3
 from skindb.store import bucket as bucket_module
+from skindb.store import stage as stage_module
 from skindb.store.bucket import Bucket
 from skindb.store.folder import Folder
 from skindb.store.lease import LEASE_SECONDS
 from skindb.store.log import Log
 from skindb.store.place import UnavailableError
-from skindb.store.stage import SHARD
 from skindb.store.verified import CHANGED
 
 WRITERS = 8
@@ -79,19 +80,22 @@ def test_commit__is_read_back_as_it_was(home):
     assert db.verify() == []
 
 
-def test_stage__whole_shards_are_put_and_read_in_parts(home):
-    area = np.arange(2 * SHARD + 100, dtype=np.float32)
+def test_stage__whole_shards_are_written_and_read_in_parts(home, monkeypatch):
+    monkeypatch.setattr(stage_module, "MAX_OBJECT_BYTES", 1)
+    area = np.arange(2 * BLOCK_SURFELS + 100, dtype=np.float32)
     with Database(home).stage("capture", "A1") as stage:
         stage.write({"surfels": dataset({"surfel_area": area}).chunk(surfel=1000)})
-        stage.put("surfels", "surfel_area", SHARD, area[SHARD : 2 * SHARD] + 1)
         stage.commit({})
-    area[SHARD : 2 * SHARD] += 1
     db = Database(home)
     np.testing.assert_array_equal(
         db.read("capture", "A1")["surfels/surfel_area"].values, area
     )
-    part = db.read("capture", "A1")["surfels/surfel_area"][SHARD + 5 : SHARD + 300 : 17]
-    np.testing.assert_array_equal(part.values, area[SHARD + 5 : SHARD + 300 : 17])
+    part = db.read("capture", "A1")["surfels/surfel_area"][
+        BLOCK_SURFELS + 5 : BLOCK_SURFELS + 300 : 17
+    ]
+    np.testing.assert_array_equal(
+        part.values, area[BLOCK_SURFELS + 5 : BLOCK_SURFELS + 300 : 17]
+    )
     assert db.verify() == []
 
 

@@ -22,9 +22,10 @@ from stored import commit, groups
 import skindb
 from skindb.errors import InputError
 from skindb.schema import SCHEMA_VERSION, dataset
+from skindb.schema.label import BLOCK_SURFELS
 from skindb.store import Conflict, Database
 from skindb.store import stage as stage_module
-from skindb.store.stage import SHARD, _shards
+from skindb.store.stage import _shards
 
 
 def test_read__gives_back_what_was_written(tmp_path):
@@ -120,39 +121,74 @@ def test_stage__left_without_commit_leaves_nothing(tmp_path):
     assert Database(tmp_path).takes() == []
 
 
-def test_stage__lazy_groups_become_whole_shards(tmp_path):
-    n = 2 * SHARD + 100
-    area = np.arange(n, dtype=np.float32)
-    ds = dataset({"surfel_area": area}).chunk(surfel=1000)
+def test_stage__lazy_groups_become_whole_shards(tmp_path, monkeypatch):
+    """Two tasks that write one shard would lose data."""
+    monkeypatch.setattr(stage_module, "MAX_OBJECT_BYTES", 40_000)  # two blocks of area
+    n = 3 * BLOCK_SURFELS + 100
+    arrays = {
+        "surfel_area": np.arange(n, dtype=np.float32),
+        "surfel_position": np.arange(3 * n, dtype=np.float32).reshape(n, 3),
+    }
     with Database(tmp_path).stage("capture", "A1") as stage:
-        stage.write({"surfels": ds})
-        stage.put("surfels", "surfel_area", SHARD, area[SHARD : 2 * SHARD] + 1)
-        with pytest.raises(ValueError, match="whole shards"):
-            stage.put("surfels", "surfel_area", 100, area[:SHARD])
-        stage.commit({})
-    got = Database(tmp_path).read("capture", "A1")["surfels/surfel_area"]
-    assert got.chunks == ((SHARD, SHARD, 100),)
-    area[SHARD : 2 * SHARD] += 1
-    np.testing.assert_array_equal(got.values, area)
+        stage.write({"surfels": dataset(arrays).chunk(surfel=1000)})
+        record = stage.commit({})
+    group = zarr.open_group(tmp_path / record.path, mode="r")["surfels"]
+    assert group["surfel_area"].shards == (2 * BLOCK_SURFELS,)
+    assert group["surfel_position"].shards == (BLOCK_SURFELS, 3)
+    got = Database(tmp_path).read("capture", "A1")["surfels"].to_dataset()
+    assert got.chunksizes["surfel"] == (*[BLOCK_SURFELS] * 3, 100)
+    for name, values in arrays.items():
+        np.testing.assert_array_equal(got[name].values, values)
+
+
+def test_stage__an_array_of_many_elements_has_few_objects(tmp_path):
+    """Objects have 16 MB: one for each small variable, and maps with all channels."""
+    n = 1_000_000
+    positions = np.arange(3 * n, dtype=np.float32).reshape(n, 3)
+    maps = np.ones((512, 512, 3), np.float32)
+    with Database(tmp_path).stage("model", "A1") as stage:
+        stage.write(
+            {
+                "fitted": dataset({"surfel_position": positions}),
+                "maps": dataset({"texel_diffuse_reflectance": maps}),
+            }
+        )
+        record = stage.commit({})
+    files = [file for file in (tmp_path / record.path).rglob("*") if "c" in file.parts]
+    assert sum(file.is_file() for file in files) == 2
+    group = zarr.open_group(tmp_path / record.path, mode="r")["fitted"]
+    assert group["surfel_position"].chunks == (BLOCK_SURFELS, 3)
+
+
+def test_stage__other_programs_open_a_version_without_a_warning(tmp_path):
+    record = commit(tmp_path)
+    tree = xr.open_datatree(tmp_path / record.path, engine="zarr")
+    assert tree["samples/reflectance_sample"].shape == (10, 3, 2, 3)
+    assert tree.attrs["seeds"] == [1]
+    root = zarr.open_group(tmp_path / record.path, mode="r")
+    consolidated = root.metadata.consolidated_metadata.flattened_metadata
+    members = dict(root.members(max_depth=None, use_consolidated_for_children=False))
+    assert consolidated.keys() == members.keys()
 
 
 def test_stage__large_arrays_are_written_shard_by_shard(tmp_path, monkeypatch):
-    n = SHARD + 300
+    n = BLOCK_SURFELS + 300
     samples = np.arange(n * 12, dtype=np.float32).reshape(n, 2, 2, 3)
     mapped = np.memmap(tmp_path / "samples", np.float32, "w+", shape=samples.shape)
     mapped[:] = samples
     ds = dataset({"reflectance_sample": mapped % 1000})
     blocks = []
     monkeypatch.setattr(stage_module, "MAX_UNSHARDED_BYTES", 1000)
+    monkeypatch.setattr(stage_module, "MAX_OBJECT_BYTES", 1000)
     monkeypatch.setattr(
         stage_module,
         "_shards",
-        lambda values: blocks.append(_shards(values)) or blocks[-1],
+        lambda *given: blocks.append(_shards(*given)) or blocks[-1],
     )
     with Database(tmp_path / "db").stage("capture", "A1") as stage:
         stage.write({"samples": ds})
         stage.commit({})
-    assert blocks[0].chunks[0] == (SHARD, 300)
+    assert blocks[0].chunks[0] == (BLOCK_SURFELS, 300)
     got = Database(tmp_path / "db").read("capture", "A1")["samples/reflectance_sample"]
     np.testing.assert_array_equal(got.values, ds["reflectance_sample"].values)
 
@@ -161,9 +197,9 @@ def test_stage__chunks_of_few_bytes_hold_more_surfels(tmp_path):
     """Chunks have at least half a megabyte or are a whole shard; zeros are stored like
     other values.
     """
-    n = SHARD + 300
+    n = BLOCK_SURFELS + 300
     samples = np.arange(n * 6 * 50 * 3).reshape(n, 6, 50, 3) % 1000
-    samples[SHARD:] = 0
+    samples[BLOCK_SURFELS:] = 0
     ds = dataset(
         {
             "reflectance_sample": samples.astype(np.float16),
@@ -177,7 +213,7 @@ def test_stage__chunks_of_few_bytes_hold_more_surfels(tmp_path):
         next((tmp_path / "data/capture/A1").glob("*.zarr")), mode="r"
     )["samples"]
     assert group["reflectance_sample"].chunks == (512, 6, 50, 3)  # 256 are 460 kB
-    assert group["sample_count"].chunks == (SHARD,)
+    assert group["sample_count"].chunks == (BLOCK_SURFELS,)
     got = Database(tmp_path).read("capture", "A1")["samples"].to_dataset()
     np.testing.assert_array_equal(got["reflectance_sample"].values, samples)
     assert not got["sample_count"].values.any()
@@ -202,7 +238,6 @@ def test_stage__committed_versions_are_closed(tmp_path):
         stage.commit({})
         for call in (
             lambda: stage.write(groups(2.0)),
-            lambda: stage.put("a", "b", 0, np.zeros(1)),
             lambda: stage.commit({}),
         ):
             with pytest.raises(ValueError, match="never changes"):

@@ -13,16 +13,17 @@ from stored import commit
 
 from skindb.errors import InputError
 from skindb.schema import dataset
-from skindb.store import Database
-from skindb.store.stage import SHARD
+from skindb.schema.label import BLOCK_SURFELS
+from skindb.store import Database, stage
 from skindb.store.verified import VerifiedStore
 
-N = SHARD + 500  # two shards
+N = BLOCK_SURFELS + 500  # two shards
 NAMES = ("samples/reflectance_sample", "surfels/surfel_area")
 
 
 @pytest.fixture
-def db(tmp_path):
+def db(tmp_path, monkeypatch):
+    monkeypatch.setattr(stage, "MAX_OBJECT_BYTES", 1)  # a block in each
     commit(tmp_path, n=N)
     return Database(tmp_path)
 
@@ -94,9 +95,9 @@ def test_read__what_does_not_need_the_damaged_chunk_is_still_read(db):
     (second,) = (p for p in _chunks(db) if "surfel_area" in p.parts and p.name == "1")
     _flip(second, 40)
     area = db.read("capture", "A1")["surfels/surfel_area"]
-    np.testing.assert_array_equal(area[:SHARD], 1.0)
+    np.testing.assert_array_equal(area[:BLOCK_SURFELS], 1.0)
     with pytest.raises(InputError, match="surfel_area/c/1"):
-        area[SHARD:].compute()
+        area[BLOCK_SURFELS:].compute()
 
 
 def test_read__a_chunk_of_another_version_is_refused(db, tmp_path):
@@ -186,9 +187,9 @@ def test_stage__tables_are_kept_beside_the_version_and_verified(db):
     tables = dataset(
         {"region_area": [1.0, np.nan]}, coords={"region": ["face", "nose"]}
     )
-    with db.stage("model", "A1") as stage:
-        stage.write({"surfels": dataset({"surfel_area": np.ones(3)})}, tables=tables)
-        record = stage.commit({})
+    with db.stage("model", "A1") as staged:
+        staged.write({"surfels": dataset({"surfel_area": np.ones(3)})}, tables=tables)
+        record = staged.commit({})
     assert db.tables(record).equals(tables)
     assert record.contents["tables"]["labels"] == {"region": ["face", "nose"]}
     assert db.verify() == []
