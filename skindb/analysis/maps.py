@@ -267,22 +267,21 @@ def _texel_statistics(
     """
     values = contrast.quantities.values
     count = np.isfinite(values).sum(axis=0)
-    able = np.flatnonzero(count >= max(min_fraction * len(values), 1))
-    if not able.size:
+    able = count >= max(min_fraction * len(values), 1)
+    if not able.any():
         raise ValueError(
             f"no texel with values of {min_fraction:.0%} of the {len(values)} subjects"
         )
-    test = contrast_test(contrast, values[:, able].astype(float), max_draws, rng)
+    measured = np.where(able, values, np.float32(np.nan))
+    test = contrast_test(contrast, measured, max_draws, rng)
     statistics = {
         variables.MAP_EFFECT: test.effects.slope,
         variables.MAP_EFFECT_HALF_WIDTH: (test.effects.high - test.effects.low) / 2,
         variables.MAP_EFFECT_P: test.p,
         variables.MAP_EFFECT_P_ADJUSTED: test.p_adjusted,
     }
-    placed = {name: np.full(len(count), np.nan, np.float32) for name in statistics}
-    for name, part in statistics.items():
-        placed[name][able] = part
-    return placed | {variables.MAP_EFFECT_COUNT: count}, test.permutations
+    single = {name: np.float32(part) for name, part in statistics.items()}
+    return single | {variables.MAP_EFFECT_COUNT: count}, test.permutations
 
 
 def tabulate_effect_maps(maps: xr.Dataset) -> Table:

@@ -12,7 +12,7 @@ each over its number of subjects; in one dimension it is the square of Welch's t
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, islice, permutations, product
+from itertools import chain, combinations, islice, permutations, product
 from math import factorial, prod
 from typing import Any
 
@@ -25,6 +25,7 @@ from skindb.types import Array, Index, Mask, float64
 
 Draw = NDArray[Any]  # an order, signs or labels of the subjects, or many of them
 SUMS = 8  # values in memory per draw and quantity, or subject
+TILE = 1 << 14  # quantities of which double-precision copies are in memory at a time
 # relative to the sum of weighted squares; smaller differences are dominated by rounding
 CANCELLED = 1e-6
 BATCH = 1 << 22  # number of permuted values in memory at a time: 32 MB
@@ -148,7 +149,8 @@ def effects(
         the covariates determine the regressor.
     """
     slope, error, spread, freedom = np.full((4, values.shape[1]), np.nan)
-    for fit in _regressions(values, regressor, covariates):
+    tiles = _regressions(values, regressor, covariates)
+    for fit in chain.from_iterable(tiles):
         y = fit.residual()
         columns = fit.columns
         slope[columns] = fit.regressor @ y / float(fit.regressor @ fit.regressor)
@@ -165,6 +167,7 @@ def paired_effects(differences: Array) -> Effects:
     The error is the standard error of the mean, and `spread` the standard deviation of
     the differences.
     """
+    differences = float64(differences)
     finite = np.isfinite(differences)
     count = finite.sum(axis=0)
     total = np.where(finite, differences, 0.0).sum(axis=0)
@@ -214,8 +217,12 @@ def permutation_p(
         positive); the number of permutations. The smallest p is 1 / (count + 1).
     """
     n = len(regressor)
-    orders, count = _draws(
-        factorial(n), permutations(range(n)), lambda: rng.permutation(n), max_draws
+    orders = _draws(
+        factorial(n),
+        lambda: permutations(range(n)),
+        lambda: rng.permutation(n),
+        max_draws,
+        rng,
     )
 
     def redraw(fit: _Regression, order: Draw) -> tuple[Index, Array]:
@@ -223,11 +230,11 @@ def permutation_p(
         places = np.argsort(order[:, fit.rows], axis=1)
         return places, np.ones(places.shape)
 
-    fits = [
-        replace(fit, values=fit.residual())
-        for fit in _regressions(values, regressor, covariates)
-    ]
-    return _max_t_p(fits, values.shape, orders, count, redraw)
+    tiles = (
+        [replace(fit, values=fit.residual()) for fit in fits]
+        for fits in _regressions(values, regressor, covariates)
+    )
+    return _max_t_p(tiles, values.shape, *orders, redraw)
 
 
 def sign_flip_p(
@@ -237,25 +244,29 @@ def sign_flip_p(
     subjects; see `permutation_p`.
     """
     n = len(differences)
-    fits = []
-    for rows, columns in missing_patterns(differences):
-        if (size := int(rows.sum())) >= 2:
-            block = differences[np.ix_(rows, columns)]
-            fits.append(
-                _Regression(rows, columns, np.ones(size), np.empty((size, 0)), block)
-            )
-    if not fits:
+    if (np.isfinite(differences).sum(axis=0) < 2).all():
         raise ValueError("paired differences need at least two subjects")
-    every_sign = product((1.0, -1.0), repeat=n)
-    signs, count = _draws(
-        2**n, every_sign, lambda: rng.choice((1.0, -1.0), n), max_draws
+    tiles = (
+        [
+            _Regression(rows, columns, np.ones(size), np.empty((size, 0)), block)
+            for rows, columns, block in patterns
+            if (size := len(block)) >= 2
+        ]
+        for patterns in _tiles(differences)
+    )
+    signs = _draws(
+        2**n,
+        lambda: product((1.0, -1.0), repeat=n),
+        lambda: rng.choice((1.0, -1.0), n),
+        max_draws,
+        rng,
     )
 
     def redraw(fit: _Regression, sign: Draw) -> tuple[Index, Array]:
         sign = sign[:, fit.rows]
         return np.tile(np.arange(sign.shape[1]), (len(sign), 1)), sign
 
-    return _max_t_p(fits, differences.shape, signs, count, redraw)
+    return _max_t_p(tiles, differences.shape, *signs, redraw)
 
 
 def missing_patterns(values: Array) -> Iterator[tuple[Mask, Index]]:
@@ -274,37 +285,52 @@ def missing_patterns(values: Array) -> Iterator[tuple[Mask, Index]]:
             yield rows, columns
 
 
+def _tiles(values: Array) -> Iterator[list[tuple[Mask, Index, Array]]]:
+    """Missing patterns of some quantities at a time, with the values (rows, columns) in
+    double precision.
+    """
+    for start in range(0, values.shape[1], TILE):
+        tile = float64(values[:, start : start + TILE])
+        yield [
+            (rows, start + columns, tile[np.ix_(rows, columns)])
+            for rows, columns in missing_patterns(tile)
+        ]
+
+
 def _regressions(
     values: Array, regressor: Array, covariates: Array | None
-) -> list[_Regression]:
-    """Quantities grouped by the subjects who have them, if their effect can be estimated."""
-    fits = []
+) -> Iterator[list[_Regression]]:
+    """Quantities grouped by the subjects who have them, if their effect can be
+    estimated, some at a time.
+    """
+    found = False
     fault = ValueError("no subject has any of the quantities")
     x = float64(regressor)
     design = np.ones((len(x), 1))
     if covariates is not None:
         design = np.column_stack([design, float64(covariates)])
-    for rows, columns in missing_patterns(values):
-        try:
-            adjusted, basis = _adjusted(x[rows], design[rows])
-            fit = _Regression(
-                rows, columns, adjusted, basis, values[np.ix_(rows, columns)]
-            )
-            length = np.linalg.norm(fit.regressor)
-            decides = np.abs(fit.regressor) > 1e-6 * length
-            if (decides & (fit.leverage > 1 - 1e-9)).any():
-                # permutations of such a slope are not comparable either
-                raise ValueError(
-                    "each group must have two subjects: the effect depends on one "
-                    "subject and has no error"
-                )
-        except ValueError as error:
-            fault = error
-            continue
-        fits.append(fit)
-    if not fits:
+    for patterns in _tiles(values):
+        fits = []
+        for rows, columns, block in patterns:
+            try:
+                adjusted, basis = _adjusted(x[rows], design[rows])
+                fit = _Regression(rows, columns, adjusted, basis, block)
+                length = np.linalg.norm(fit.regressor)
+                decides = np.abs(fit.regressor) > 1e-6 * length
+                if (decides & (fit.leverage > 1 - 1e-9)).any():
+                    # permutations of such a slope are not comparable either
+                    raise ValueError(
+                        "each group must have two subjects: the effect depends on one "
+                        "subject and has no error"
+                    )
+            except ValueError as error:
+                fault = error
+                continue
+            fits.append(fit)
+        found = found or bool(fits)
+        yield fits
+    if not found:
         raise fault
-    return fits
 
 
 def _adjusted(x: Array, design: Array) -> tuple[Array, Array]:
@@ -329,16 +355,24 @@ def _adjusted(x: Array, design: Array) -> tuple[Array, Array]:
 
 def _draws(
     total: int,
-    enumeration: Iterable[Any],
+    enumeration: Callable[[], Iterable[Any]],
     draw: Callable[[], Draw],
     max_draws: int,
-) -> tuple[Iterator[Draw], int]:
-    """Draws and their number: all of `total` but the first, which is the identity, or
-    random ones if there are more than `max_draws`.
+    rng: np.random.Generator,
+) -> tuple[Callable[[], Iterator[Draw]], int]:
+    """Function that returns the same draws whenever it is called, and their number: all
+    of `total` but the first, which is the identity, or random ones if there are more
+    than `max_draws`.
     """
     if total - 1 <= max_draws:
-        return map(np.array, islice(enumeration, 1, None)), total - 1
-    return (draw() for _ in range(max_draws)), max_draws
+        return lambda: map(np.array, islice(enumeration(), 1, None)), total - 1
+    state = rng.bit_generator.state
+
+    def drawn() -> Iterator[Draw]:
+        rng.bit_generator.state = state
+        return (draw() for _ in range(max_draws))
+
+    return drawn, max_draws
 
 
 def _batches(draws: Iterator[Draw], entries: int) -> Iterator[Draw]:
@@ -348,9 +382,9 @@ def _batches(draws: Iterator[Draw], entries: int) -> Iterator[Draw]:
 
 
 def _max_t_p(
-    fits: Sequence[_Regression],
+    tiles: Iterable[list[_Regression]],
     shape: tuple[int, ...],
-    draws: Iterator[Draw],
+    draws: Callable[[], Iterator[Draw]],
     count: int,
     redraw: Redraw,
 ) -> tuple[Array, Array, int]:
@@ -358,18 +392,22 @@ def _max_t_p(
     of all quantities; the draws are common to all fits.
     """
     observed = np.full(shape[1], np.nan)
-    for fit in fits:
-        observed[fit.columns] = np.abs(fit.statistics(fit.residual()[None])[0])
-    threshold = observed * REACHED
     alone = np.zeros(shape[1])
-    family = np.zeros(shape[1])
-    for batch in _batches(draws, SUMS * sum(shape)):
-        largest = np.zeros(len(batch))
+    largest = np.zeros(count)
+    entries = SUMS * (shape[0] + min(shape[1], TILE))
+    for fits in tiles:
         for fit in fits:
-            statistics = np.abs(fit.permuted_statistics(*redraw(fit, batch)))
-            alone[fit.columns] += (statistics >= threshold[fit.columns]).sum(axis=0)
-            largest = np.maximum(largest, statistics.max(axis=1))
-        family += (largest[:, None] >= threshold).sum(axis=0)
+            observed[fit.columns] = np.abs(fit.statistics(fit.residual()[None])[0])
+        done = 0
+        for batch in _batches(draws(), entries):
+            highest = largest[done : done + len(batch)]
+            for fit in fits:
+                statistics = np.abs(fit.permuted_statistics(*redraw(fit, batch)))
+                reached = statistics >= REACHED * observed[fit.columns]
+                alone[fit.columns] += reached.sum(axis=0)
+                np.maximum(highest, statistics.max(axis=1), out=highest)
+            done += len(batch)
+    family = count - np.searchsorted(np.sort(largest), observed * REACHED)
     exceeding = np.where(np.isfinite(observed), [alone, family], np.nan)
     p, adjusted = (exceeding + 1) / (count + 1)
     return p, adjusted, count
@@ -404,16 +442,17 @@ def between_groups_p(
     observed = np.repeat(np.arange(len(sizes)), sizes)
     draws, count = _draws(
         factorial(len(group)) // prod(map(factorial, sizes.tolist())),
-        _arrangements(sizes.tolist()),
+        lambda: _arrangements(sizes.tolist()),
         lambda: rng.permutation(observed),
         max_draws,
+        rng,
     )
     # sorted by group, so that the order of the subjects does not change the bits of the result
     y = values[np.argsort(group, kind="stable")]
     y = y - y.mean(axis=0)
     y = np.where(np.abs(y) > ROUNDING * np.abs(values).max(), y, 0.0)
     statistic = _between(y, observed[None], sizes)[0]
-    batches = _batches(draws, len(y) * len(sizes))
+    batches = _batches(draws(), len(y) * len(sizes))
     drawn = (_between(y, labels, sizes) for labels in batches)
     return statistic, _largest_p(statistic, drawn, count), count
 
@@ -440,9 +479,12 @@ def within_subjects_p(
     """
     orders = [_orders(row) for row in np.asarray(np.isfinite(values).all(axis=2))]
     lengths = [len(order) for order in orders]
-    every_choice = product(*map(range, lengths))
     choices, count = _draws(
-        prod(lengths), every_choice, lambda: rng.integers(lengths), max_draws
+        prod(lengths),
+        lambda: product(*map(range, lengths)),
+        lambda: rng.integers(lengths),
+        max_draws,
+        rng,
     )
     rows = np.arange(len(values))[:, None]
 
@@ -451,7 +493,7 @@ def within_subjects_p(
         return _within(values[rows, np.stack(order, axis=1)])
 
     statistic = _within(values[None])[0]
-    drawn = map(permuted, _batches(choices, values.size))
+    drawn = map(permuted, _batches(choices(), values.size))
     return statistic, _largest_p(statistic, drawn, count), count
 
 

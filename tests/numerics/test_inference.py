@@ -257,7 +257,7 @@ def test_paired_effects__are_those_of_scipy():
 @pytest.mark.parametrize("covariates", [0, 2])
 @pytest.mark.parametrize("kind", ["permutation", "flips"])
 def test_permutation_p__as_if_the_values_were_permuted(monkeypatch, kind, covariates):
-    """With gaps, constants, effects of a million standard deviations, and no scatter at all."""
+    """With gaps, constants, no scatter, effects of a million standard deviations; also in tiles."""
     rng = np.random.default_rng(0)
     n = 24
     q = 60
@@ -281,6 +281,9 @@ def test_permutation_p__as_if_the_values_were_permuted(monkeypatch, kind, covari
         return fit.statistics(fit.values[order] * sign[..., None])
 
     result = found()
+    monkeypatch.setattr(inference, "TILE", 7)
+    for one, other in zip(result, found(), strict=True):
+        np.testing.assert_array_equal(one, other)
     monkeypatch.setattr(
         inference._Regression, "permuted_statistics", of_permuted_values
     )
