@@ -13,10 +13,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib import resources
 from io import BufferedReader
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from skindb.errors import Fault, InputError, input_error
 
@@ -89,11 +88,8 @@ def json_depth(text: str) -> int:
     """
     if (count := text.count("[") + text.count("{")) <= 1:
         return count
-    bare = np.frombuffer(STRING.sub("", text).encode("utf-8"), np.uint8)
-    step = np.zeros(len(bare) + 1, np.int8)
-    step[1:][(bare == ord("[")) | (bare == ord("{"))] = 1
-    step[1:][(bare == ord("]")) | (bare == ord("}"))] = -1
-    return int(np.cumsum(step, dtype=np.int32).max())
+    brackets = re.sub(r"[^][{}]+", "", STRING.sub("", text))
+    return max(accumulate((1 if b in "[{" else -1 for b in brackets), initial=0))
 
 
 def _not_opened(path: Path, error: OSError) -> InputError:
@@ -208,8 +204,9 @@ def csv_text(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def _cell(value: Any) -> Any:
-    if isinstance(value, np.generic):
-        value = value.item()  # whose digits do not depend on the print options of NumPy
+    if hasattr(value, "tolist"):
+        # its digits do not depend on the print options of NumPy
+        value = value.tolist()
     if value is None or value != value:
         return ""
     if not isinstance(value, str) or NUMBER.fullmatch(value):
@@ -224,12 +221,10 @@ def plain(value: Any) -> Any:
     """
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
+    if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, bool | int | str) else str(value)

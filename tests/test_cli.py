@@ -609,7 +609,7 @@ run = CliRunner().invoke
 calls = [[], *([name] for name in cli.commands)]
 calls += [["analyze", "db", study] for study in declarations()]
 assert not any(run(cli, [*call, "--help"]).exit_code for call in calls)
-heavy = {"numba", "scipy", "sklearn", "dask", "zarr", "xarray", "matplotlib"}
+heavy = {"numpy", "dask", "zarr", "xarray", "matplotlib"}
 science = {"analysis", "fit", "render", "reflectance", "optics", "geometry", "numerics"}
 print(sorted((heavy | {f"skindb.{name}" for name in science}) & set(sys.modules)))
 """
@@ -618,6 +618,29 @@ print(sorted((heavy | {f"skindb.{name}" for name in science}) & set(sys.modules)
 def test_help__of_every_command_and_study_imports_no_science():
     done = subprocess.run(
         [sys.executable, "-c", HELP_OF_ALL], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "[]"
+
+
+METADATA = """
+import sys
+from click.testing import CliRunner
+from skindb.cli import cli
+for command, *more in (["info"], ["audit"], ["release"], ["consent", "S01"]):
+    result = CliRunner().invoke(cli, [command, sys.argv[1], *more])
+    assert result.exit_code == 0, result.output
+heavy = {"numba", "scipy", "sklearn", "dask", "matplotlib"}
+science = {"analysis", "fit", "render", "reflectance", "optics", "geometry", "numerics"}
+print(sorted((heavy | {f"skindb.{name}" for name in science}) & set(sys.modules)))
+"""
+
+
+def test_commands_that_read_only_records__import_no_science(fitted_database):
+    done = subprocess.run(
+        [sys.executable, "-c", METADATA, fitted_database.url],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert done.stdout.strip() == "[]"
 

@@ -2,16 +2,16 @@
 escaped, and progress on standard error: bars for people, lines of JSON for programs.
 """
 
+from __future__ import annotations
+
 import json
 import sys
 import time
-from collections.abc import Callable
 
 import click
 
 from skindb.cli.options import progress_style
 from skindb.errors import escaped
-from skindb.types import silent
 
 Pace = tuple[float | None, float | None]  # steps per minute, and seconds left
 MIN_INTERVAL_S = {"bar": 0.2, "json": 1.0}  # between two reports of the same stage
@@ -64,10 +64,8 @@ class Progress:
         self.takes_done = 0
         self.takes_total = 0
 
-    def __reduce__(
-        self,
-    ) -> tuple[Callable[[], Callable[[str, int, int], None]], tuple[()]]:
-        return _silent_progress, ()
+    def __reduce__(self) -> tuple[type[Progress], tuple[str]]:
+        return Progress, ("none",)
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         """Report that `done` of `total` steps of `stage` are finished."""
@@ -169,10 +167,6 @@ def _pace(done: int, total: int, seconds: float) -> Pace:
     if not done:
         return None, None
     return 60 * done / max(seconds, 1e-9), (total - done) * seconds / done
-
-
-def _silent_progress() -> Callable[[str, int, int], None]:
-    return silent
 
 
 def bar(*, plain: bool = False) -> Progress:

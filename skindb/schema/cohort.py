@@ -7,7 +7,6 @@ from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import dask.array as da
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
@@ -337,6 +336,9 @@ def _lazy(
     labels: Mapping[str, Sequence[Any]],
 ) -> xr.Variable:
     """A variable of every take, a block for each, whose task carries its own source alone."""
+    # a third of the start-up of `skindb info`, which forms no arrays
+    import dask.array as da
+
     spec = VARIABLES[name]
     shape = tuple(extent[dim] for dim in spec.dims)
     absent = _absent(name, ())
@@ -360,8 +362,10 @@ def _lazy(
     return xr.Variable((TAKE, *spec.dims), data, plain.attrs)
 
 
-def _one_each(sources: Sequence[Source | None]) -> da.Array:
-    """An array of objects in blocks of one."""
+def _one_each(sources: Sequence[Source | None]) -> Any:
+    """A Dask array of objects in blocks of one."""
+    import dask.array as da
+
     name = f"sources-{uuid.uuid4().hex}"
     blocks = {}
     for i, source in enumerate(sources):

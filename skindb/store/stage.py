@@ -11,7 +11,6 @@ from datetime import UTC, datetime
 from types import TracebackType
 from typing import Any, Self
 
-import dask.array as da
 import numpy as np
 import xarray as xr
 import zarr
@@ -475,6 +474,9 @@ def _shards(values: np.ndarray[Any, Any], rows: int) -> Any:
     """An array as lazy shards; `dask.array.from_array` would copy a memory-mapped file
     into memory.
     """
+    # a third of the start-up of `skindb info`, which forms no arrays
+    import dask.array as da
+
     starts = range(0, len(values), rows)
     sizes = tuple(len(values[start : start + rows]) for start in starts)
 
