@@ -147,7 +147,9 @@ def test_backup__is_refused_in_one_line(db, dest, tmp_path):
 
 def test_backup__names_damage_and_exits_with_1(db, dest, tmp_path):
     _done("backup", db.root, dest)
-    digest = db.place.digest(f"{db.record('model', 'B').path}/surfels/surfel_area/c/0")
+    digest = db.place.digests(
+        f"{db.record('model', 'B').path}/surfels/surfel_area/c/0"
+    ).whole
     file = Path(dest) / "files" / digest[:2] / digest
     file.write_bytes(b"x")
     for command in (

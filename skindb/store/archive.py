@@ -377,8 +377,8 @@ def content_key(digest: str) -> str:
 def items_of(record: Record, manifest: Manifest) -> list[Item]:
     """The files of a version that its manifest lists, and its tables."""
     items: list[Item] = [
-        (f"{record.path}/{name}", digest, size)
-        for name, (digest, size) in manifest.items()
+        (f"{record.path}/{name}", file.digests.whole, file.size)
+        for name, file in manifest.items()
     ]
     return [
         *items,

@@ -29,7 +29,14 @@ from skindb.errors import InputError, input_error
 from skindb.files import cache_folder, make_private
 from skindb.limits import MAX_STORE_JSON_BYTES
 from skindb.store.folder import Folder
-from skindb.store.place import Guard, Place, UnavailableError, require_parts
+from skindb.store.place import (
+    Digests,
+    Guard,
+    Place,
+    UnavailableError,
+    digests_of,
+    require_parts,
+)
 from skindb.store.s3 import (
     RETRY_TIMEOUT,
     BrokenAnswerError,
@@ -69,8 +76,8 @@ class Bucket:
         self._is_conditional = False
         self._pending: dict[str, bytes] = {}  # metadata that are not written yet
         self._kept: dict[str, bytes] = {}  # metadata that were read, which never change
-        # key -> digest and entity tag of an object that this process wrote
-        self._written: dict[str, tuple[str, str]] = {}
+        # key -> digests and entity tag of an object that this process wrote
+        self._written: dict[str, tuple[Digests, str]] = {}
 
     def __repr__(self) -> str:
         return f"Bucket({self.name!r})"
@@ -79,7 +86,7 @@ class Bucket:
         return Bucket, (self.name,)
 
     def writable(self, key: str) -> Store:
-        """A zarr store at a key, written by this process only; `digest` does not read
+        """A zarr store at a key, written by this process only; `digests` does not read
         again what was written to it.
         """
         return BucketStore(self, self._path(key))
@@ -143,7 +150,7 @@ class Bucket:
         empty if it does not exist.
         """
         try:
-            self.identity(key)
+            self._ask(key, lambda: self._store.head(self._path(key)))
         except FileNotFoundError:
             return (
                 "folder"
@@ -193,26 +200,18 @@ class Bucket:
 
         return self._ask(key, fetch)
 
-    def digest(self, key: str) -> str:
-        """SHA-256 digest of an object, or of the content that this process has just
+    def digests(self, key: str) -> Digests:
+        """Digests of an object, or of the content that this process has just
         written; see `make_durable`.
         """
         path = self._path(key)
         if (written := self._written.pop(path, None)) is not None:
             return written[0]
 
-        def fetch() -> str:
-            digest = hashlib.sha256()
-            for part in self._store.get(path).stream(min_chunk_size=FETCH_BYTES):
-                digest.update(part)
-            return digest.hexdigest()
+        def fetch() -> Digests:
+            return digests_of(self._store.get(path).stream(min_chunk_size=FETCH_BYTES))
 
         return self._ask(key, fetch)
-
-    def identity(self, key: str) -> tuple[Hashable, ...]:
-        """Identity of an object, which changes whenever the object is replaced."""
-        path = self._path(key)
-        return _identity(self._ask(key, lambda: self._store.head(path)))
 
     def identities(self, key: str) -> dict[str, tuple[Hashable, ...]]:
         """The identity of every object below a key, by its path relative to the key."""
@@ -390,10 +389,10 @@ class Bucket:
         self._pending[self._path(key)] = data
 
     def write(self, key: str, data: bytes) -> None:
-        """Write an object, and keep its digest for `digest`."""
+        """Write an object, and keep its digests for `digests`."""
         path = self._path(key)
         tag = self._put(path, data)
-        self._written[path] = hashlib.sha256(data).hexdigest(), tag
+        self._written[path] = digests_of([data]), tag
 
     def _metadata(self, path: str) -> bytes:
         """Contents of a zarr.json object, which is requested only once."""

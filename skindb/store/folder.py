@@ -1,7 +1,6 @@
 """A local folder as the location of a database."""
 
 import errno
-import hashlib
 import os
 import shutil
 import stat
@@ -9,6 +8,7 @@ import sys
 import uuid
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from contextlib import suppress
+from functools import partial
 from io import BufferedReader
 from pathlib import Path
 
@@ -17,7 +17,14 @@ from zarr.storage import LocalStore
 from skindb.errors import InputError, add_filename
 from skindb.files import PRIVATE, make_private, open_regular
 from skindb.limits import MAX_STORE_JSON_BYTES
-from skindb.store.place import STAGING, Guard, inside
+from skindb.store.place import (
+    BLOCK_BYTES,
+    STAGING,
+    Digests,
+    Guard,
+    digests_of,
+    inside,
+)
 
 # below a version; zarr creates group/array/c and a folder for each dim except the last
 MAX_FOLDER_DEPTH = 16
@@ -123,14 +130,10 @@ class Folder:
         with self._open(key, MAX_STORE_JSON_BYTES) as file:
             return file.read()
 
-    def digest(self, key: str) -> str:
-        """SHA-256 digest of a file, read in blocks."""
+    def digests(self, key: str) -> Digests:
+        """Digests of a file, read in blocks."""
         with self._open(key, sys.maxsize) as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-
-    def identity(self, key: str) -> tuple[int, ...]:
-        """Identity of a file, which changes whenever the file is written or replaced."""
-        return _identity(inside(self.root, key).lstat())
+            return digests_of(iter(partial(stream.read, BLOCK_BYTES), b""))
 
     def identities(self, key: str) -> dict[str, tuple[Hashable, ...]]:
         """The identity of every file below a key, by its path relative to the key;

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import cast
 
 from skindb.errors import InputError, input_error
 from skindb.limits import RESUMABLE_SECONDS
@@ -272,16 +271,12 @@ def _bytes_below(place: Place, key: str) -> int:
 
 def _temporary_files(place: Place, now: Clock) -> Iterator[Garbage]:
     """Temporary files of killed writers."""
-    for name in place.children(STAGING) if place.file_type(STAGING) == "folder" else []:
+    sizes = place.sizes(STAGING) if place.file_type(STAGING) == "folder" else {}
+    for name, size in sizes.items():
         key = f"{STAGING}/{name}"
-        with suppress(FileNotFoundError):  # removed by a running writer
-            size = cast(int, place.identity(key)[0])
-            yield Garbage(
-                key,
-                "a temporary file of a killed writer",
-                size,
-                _recent_reason(place, [key], now),
-            )
+        if size >= 0:
+            reason = _recent_reason(place, [key], now)
+            yield Garbage(key, "a temporary file of a killed writer", size, reason)
 
 
 def _scratch_folders(place: Place, now: Clock) -> Iterator[Garbage]:

@@ -4,11 +4,12 @@ never lead outside it, and the protocol by which they are read and written.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 from collections.abc import Callable, Hashable, Iterable
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from zarr.abc.store import Store
 
@@ -37,6 +38,39 @@ TRANSIENT = ("first",)
 LEASE_KINDS = {"first": "model"}
 VERSION = rf"data/{KIND}/{TAKE}/{TIME_HEX}\.zarr"
 Guard = Callable[[], None]  # raises if a file must not be written any more
+BLOCK_BYTES = 1 << 20  # of a file, the smallest part that is compared with a digest
+
+
+class Digests(NamedTuple):
+    """SHA-256 digests of a file, and of each of its blocks if there are several."""
+
+    whole: str
+    blocks: tuple[str, ...] = ()
+
+
+def digests_of(parts: Iterable[bytes]) -> Digests:
+    """Digests of the contents that these parts are together."""
+    whole = hashlib.sha256()
+    blocks: list[str] = []
+    rest = bytearray()
+    for part in parts:
+        whole.update(part)
+        rest += part
+        complete = len(rest) // BLOCK_BYTES * BLOCK_BYTES
+        blocks += block_digests(rest[:complete])
+        del rest[:complete]
+    blocks += block_digests(rest)
+    return Digests(whole.hexdigest(), tuple(blocks) if len(blocks) > 1 else ())
+
+
+def block_digests(content: bytes | bytearray) -> list[str]:
+    """SHA-256 digest of each block."""
+    view = memoryview(content)
+    starts = range(0, len(view), BLOCK_BYTES)
+    return [
+        hashlib.sha256(view[start : start + BLOCK_BYTES]).hexdigest()
+        for start in starts
+    ]
 
 
 def subject_of(take: str) -> str:
@@ -171,15 +205,12 @@ class Place(Protocol):
     def read_small(self, key: str) -> bytes:
         """Contents of a JSON file, whose size is limited."""
 
-    def digest(self, key: str) -> str:
-        """SHA-256 digest of a file."""
-
-    def identity(self, key: str) -> tuple[Hashable, ...]:
-        """Identity of a file, which changes whenever the file is written or replaced."""
+    def digests(self, key: str) -> Digests:
+        """Digests of a file."""
 
     def identities(self, key: str) -> dict[str, tuple[Hashable, ...]]:
-        """The identity of every file below a key, by its path relative to the key;
-        (-1,) if not a regular file.
+        """The identity of every file below a key, which changes whenever the file is
+        written or replaced, by its path relative to the key; (-1,) if not a regular file.
         """
 
     def proves(self, identity: tuple[Hashable, ...], content: bytes) -> bool:

@@ -49,7 +49,7 @@ from skindb.store.record import (
     own_takes,
     subjects_of,
 )
-from skindb.store.verified import Manifest, read_beside
+from skindb.store.verified import Committed, Manifest, read_beside
 
 MIN_CHUNK_SURFELS = 256  # in a chunk, the smallest unit of reading
 MIN_CHUNK_BYTES = 1 << 19  # a smaller chunk gets more surfels
@@ -233,7 +233,7 @@ class Stage:
             generation=self.base + 1,
             path=self.path,
             created=self.created,
-            bytes=sum(size for _, size in files.values()),
+            bytes=sum(file.size for file in files.values()),
             provenance=attrs,
             names=tuple(names),
             admissions=self._admissions(),
@@ -260,7 +260,7 @@ class Stage:
         """
         nodes = {}
         for node in sorted(self._nodes, key=lambda name: (name.count("/"), name)):
-            with suppress(FileNotFoundError):  # `_written_files` reports it
+            with suppress(OSError):  # `_written_files` reports a missing one
                 content = self.place.read(f"{self.path}/{node}/zarr.json")
                 nodes[node] = json.loads(content)
         root = {
@@ -277,7 +277,7 @@ class Stage:
         sync(self.place.writable(self.path).set("zarr.json", buffer))
 
     def _written_files(self) -> Manifest:
-        """Digest and size of every file, with those of all groups that were written."""
+        """Size and digests of every file, with those of all groups that were written."""
         sizes = self.place.sizes(self.path)
         gone = [
             name for name in sorted(self.groups) if f"{name}/zarr.json" not in sizes
@@ -290,7 +290,7 @@ class Stage:
                 "run the command again",
             )
         return {
-            name: (self.place.digest(f"{self.path}/{name}"), size)
+            name: Committed(size, self.place.digests(f"{self.path}/{name}"))
             for name, size in sorted(sizes.items())
             if size >= 0
         }

@@ -1,16 +1,15 @@
-"""Verified reading of a version: every file is compared with its committed digest
-before it is used.
+"""Verified reading of a version: every block of a file is compared with its committed
+digest before it is used.
 """
 
 import asyncio
 import hashlib
 import math
 import re
-import threading
-from collections import Counter, defaultdict
-from collections.abc import AsyncIterator, Hashable, Iterable
+from collections import Counter
+from collections.abc import AsyncIterator, Iterable
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import xarray as xr
 from zarr.abc.store import (
@@ -24,7 +23,7 @@ from zarr.core.buffer import Buffer, BufferPrototype
 
 from skindb.errors import Fault, InputError, input_error
 from skindb.schema.label import BLOCK_SURFELS
-from skindb.store.place import Place
+from skindb.store.place import BLOCK_BYTES, Digests, Place, block_digests
 from skindb.store.record import Record, json_object
 
 CURE = "restore this file from a backup, or compute the version again"
@@ -50,11 +49,20 @@ MAX_CHUNK_BYTES = 1 << 32
 MAX_DIMS = 8
 MAX_CODECS = 8  # of an array, and of the chunks inside a shard; skindb writes three
 SHARDING = "sharding_indexed"
-Manifest = dict[str, tuple[str, int]]  # file -> SHA-256 digest and size in bytes
+
+
+class Committed(NamedTuple):
+    """A file as it was committed."""
+
+    size: int  # in bytes
+    digests: Digests
+
+
+Manifest = dict[str, Committed]
 
 
 def read_manifest(place: Place, record: Record) -> Manifest:
-    """Digest and size of every file of a version; `InputError` if the manifest is not
+    """Every file of a version as it was committed; `InputError` if the manifest is not
     the committed one.
     """
     return manifest_from_json(read_beside(place, record, "manifest", record.manifest))
@@ -63,7 +71,8 @@ def read_manifest(place: Place, record: Record) -> Manifest:
 def manifest_from_json(content: bytes) -> Manifest:
     """The manifest in a file."""
     return {
-        name: (digest, size) for name, (digest, size) in json_object(content).items()
+        name: Committed(size, Digests(whole, tuple(blocks)))
+        for name, (size, (whole, blocks)) in json_object(content).items()
     }
 
 
@@ -119,9 +128,8 @@ class VerifiedStore(ListedStore):
     """A version as a read-only zarr store; a missing or changed file raises an
     `InputError`, and is never a fill value.
 
-    The manifest alone determines which files exist. The digest of a whole file is
-    compared before any part of it is returned; for later parts only the identity of the
-    file is compared.
+    The manifest alone determines which files exist. Every read is extended to blocks of
+    1 MiB, whose digests are compared in memory before a part of them is returned.
 
     Parameters
     ----------
@@ -143,7 +151,7 @@ class VerifiedStore(ListedStore):
 
     @cached_property
     def files(self) -> Manifest:
-        """Digest and size of every file."""
+        """Every file as it was committed."""
         return read_manifest(self.place, self.record)
 
     @cached_property
@@ -168,9 +176,6 @@ class VerifiedStore(ListedStore):
     def __setstate__(self, state: tuple[Place, Record]) -> None:
         super().__init__(read_only=True)
         self.place, self.record = state
-        # file -> identity when its digest was compared
-        self._known: dict[str, tuple[Hashable, ...]] = {}
-        self._guards: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
 
     async def get(
         self,
@@ -203,27 +208,31 @@ class VerifiedStore(ListedStore):
             yield key
 
     def _bytes(self, key: str, byte_range: ByteRequest | None) -> bytes:
-        name = f"{self.record.path}/{key}"
+        begin, end = (0, None) if byte_range is None else limits(byte_range)
+        content = self.read(key, begin, end)
+        if key.endswith("zarr.json"):
+            self._require_plausible(key, content)
+        return content
+
+    def read(self, key: str, begin: int = 0, end: int | None = None) -> bytes:
+        """Contents of a file from byte `begin`, counted from its end if negative, up to `end`."""
+        size, digests = self.files[key]
+        begin = max(begin + size, 0) if begin < 0 else begin
+        end = size if end is None else min(end, size)
+        if begin >= end:
+            return b""
+        first = begin // BLOCK_BYTES
+        last = -(-end // BLOCK_BYTES)
+        start = first * BLOCK_BYTES
+        part = (start, min(last * BLOCK_BYTES, size)) if end - begin < size else ()
         try:
-            if byte_range is None:
-                data = self.place.read(name)
-                self._require(key, hashlib.sha256(data).hexdigest())
-                if key.endswith("zarr.json"):
-                    self._require_plausible(key, data)
-                return data
-            # only one of several concurrent requests compares the digest
-            with self._guards[key]:
-                identity = self.place.identity(name)
-                if self._known.get(key) != identity:
-                    self._require(key, self.place.digest(name))
-                    self._known[key] = identity
-            return self.place.read(name, *limits(byte_range))
+            content = self.place.read(f"{self.record.path}/{key}", *part)
         except OSError as error:
             raise self._fault(key, error.strerror or "an unreadable file") from None
-
-    def _require(self, key: str, digest: str) -> None:
-        if digest != self.files[key][0]:
+        committed = digests.blocks or (digests.whole,)
+        if block_digests(content) != [*committed[first:last]]:
             raise self._fault(key, CHANGED)
+        return content[begin - start : end - start]
 
     def _require_plausible(self, key: str, content: bytes) -> None:
         """Raise an `InputError` for metadata that do not match the chunk files."""
@@ -240,7 +249,7 @@ class VerifiedStore(ListedStore):
         """Raise an `InputError` with all missing and truncated files, before values are read."""
         sizes = self.place.sizes(self.record.path)
         faults: list[Fault] = []
-        for key, (_, size) in self.files.items():
+        for key, (size, _) in self.files.items():
             if key not in sizes:
                 faults += self._fault(key, "no file").faults
             elif sizes[key] < 0:

@@ -33,6 +33,7 @@ from skindb.store.verified import (
     AS_COMMITTED,
     CHANGED,
     CURE,
+    Committed,
     Manifest,
     VerifiedStore,
     read_beside,
@@ -293,12 +294,11 @@ def _file_fault(
     return Fault(location, AS_COMMITTED, finding, CURE) if finding else None
 
 
-def _difference(place: Place, key: str, size: int, committed: tuple[str, int]) -> str:
-    digest, expected = committed
-    if size != expected:
-        return f"{size} bytes instead of {expected}"
+def _difference(place: Place, key: str, size: int, file: Committed) -> str:
+    if size != file.size:
+        return f"{size} bytes instead of {file.size}"
     try:
-        return "" if place.digest(key) == digest else CHANGED
+        return "" if place.digests(key) == file.digests else CHANGED
     except OSError as error:  # reported, so that other damage is still found
         return f"a file that cannot be read ({error.strerror})"
 

@@ -403,7 +403,7 @@ def test_backup__of_another_database_or_elsewhere_is_refused(db, dest, tmp_path)
 
 def _file_of(dest: Path, db: Database, key: str) -> Path:
     """The file of a backup that holds a file of the database."""
-    digest = backup_states(str(dest))[-1].files.get(key) or db.place.digest(key)
+    digest = backup_states(str(dest))[-1].files.get(key) or db.place.digests(key).whole
     return dest / "files" / digest[:2] / digest
 
 

@@ -15,6 +15,7 @@ from skindb.errors import InputError
 from skindb.schema import dataset
 from skindb.schema.label import BLOCK_SURFELS
 from skindb.store import Database, stage
+from skindb.store.place import BLOCK_BYTES
 from skindb.store.verified import VerifiedStore
 
 N = BLOCK_SURFELS + 500  # two shards
@@ -112,8 +113,8 @@ def test_read__a_chunk_of_another_version_is_refused(db, tmp_path):
         _read_all(db)
 
 
-def test_read__parts_of_a_shard_are_compared_too(db):
-    """If one chunk of a shard is read, the whole shard is compared, also if it changes later."""
+def test_read__parts_of_an_object_are_compared_too(db):
+    """Whatever changes after an object was opened, or read in part, is found."""
     tree = db.read("capture", "A1")
     samples = tree["samples/reflectance_sample"]
     few = zarr.open_array(
@@ -130,6 +131,61 @@ def test_read__parts_of_a_shard_are_compared_too(db):
         _ = few[3:5]
     with pytest.raises(InputError, match="found content that differs"):
         samples[:2].compute()
+
+
+def _flipped_block(content, number):
+    at = number * BLOCK_BYTES + BLOCK_BYTES // 3
+    return content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :]
+
+
+def _exchanged_blocks(content, number):
+    begin, end = number * BLOCK_BYTES, (number + 1) * BLOCK_BYTES
+    block, following = content[begin:end], content[end : end + BLOCK_BYTES]
+    return content[:begin] + following + block + content[end + BLOCK_BYTES :]
+
+
+def test_read__every_block_of_an_object_is_compared(tmp_path):
+    """Chunks in blocks that did not change are still read."""
+    n = 350_000
+    values = np.random.default_rng(7).random((n, 3), np.float32)
+    with Database(tmp_path).stage("capture", "A1") as staged:
+        staged.write({"surfels": dataset({"surfel_position": values})})
+        record = staged.commit({})
+    db = Database(tmp_path)
+    file = tmp_path / record.path / "surfels/surfel_position/c/0/0"
+    content = file.read_bytes()
+    blocks = -(-len(content) // BLOCK_BYTES)
+    assert blocks == 4
+    array = zarr.open_array(
+        VerifiedStore(db.place, record), path="surfels/surfel_position", mode="r"
+    )
+    starts = range(0, n, BLOCK_SURFELS)
+    damaged = [(_flipped_block, number) for number in range(blocks - 1)]
+    damaged += [(_exchanged_blocks, number) for number in range(blocks - 2)]
+    for damage, number in damaged:
+        file.write_bytes(damage(content, number))
+        refused = 0
+        for start in starts:
+            part = slice(start, start + BLOCK_SURFELS)
+            try:
+                np.testing.assert_array_equal(array[part], values[part])
+            except InputError:
+                refused += 1
+        assert len(starts) // 8 < refused < len(starts)
+        with pytest.raises(InputError, match="restore this file"):
+            db.read("capture", "A1")["surfels/surfel_position"].load()
+        assert len(db.verify()) == 1
+    # the index of the chunks, which every read needs
+    file.write_bytes(content[:-9] + bytes([content[-9] ^ 1]) + content[-8:])
+    for start in starts:
+        with pytest.raises(InputError, match="found content that differs"):
+            array[start : start + 1]
+    # an object that is cut after it was opened
+    file.write_bytes(content[: 2 * BLOCK_BYTES])
+    with pytest.raises(InputError, match="found content that differs"):
+        array[-1]
+    file.write_bytes(content)
+    np.testing.assert_array_equal(array[:], values)
 
 
 @pytest.mark.parametrize("scheduler", ["synchronous", "threads"])

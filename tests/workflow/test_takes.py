@@ -361,8 +361,8 @@ def _contents(db):
             record = db.record(kind, take)
             manifest = json.loads((db.root / record.beside("manifest")).read_text())
             digests = {
-                name: digest
-                for name, (digest, _) in manifest.items()
+                name: digests
+                for name, (_, digests) in manifest.items()
                 if name != "zarr.json"
             }
             about = {
