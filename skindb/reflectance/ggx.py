@@ -284,7 +284,7 @@ class LobeSampler:
         """Directions (n, 3), see `DirectionSampler`."""
         probability, roughness = mix.T
         lobe = draw[:, 0] < probability
-        turn = 2 * np.pi * draw[:, 3]
+        turn = 2 * np.pi * draw[:, 2]
         square = roughness**2
         # of the half vector (Walter et al. 2007, eq. 35), or of a direction by its cosine
         half = 1 / (1 + square * draw[:, 1] / (1 - draw[:, 1]))

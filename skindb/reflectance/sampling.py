@@ -82,18 +82,23 @@ class TableSampler:
         normal, view
             (n, 3) unit normals, and unit directions to the camera.
         draw
-            (n, 4) uniform numbers in [0, 1).
+            (n, 3) uniform numbers in [0, 1): for the choice of a basis, for the cosine,
+            and for the azimuth.
         """
         cells = self.density.shape[1]
         chosen = (draw[:, :1] > np.cumsum(mix, axis=1)[:, :-1]).sum(axis=1)
-        turn = 2 * np.pi * draw[:, 3]
+        turn = 2 * np.pi * draw[:, 2]
         cosine = np.sqrt(1 - draw[:, 1])  # of a direction drawn by its cosine
         lobe = chosen > 0
         if lobe.any():
             rising = np.cumsum(self.density, axis=1) / cells
+            start = np.concatenate([np.zeros((len(rising), 1)), rising], axis=1)
             which = chosen[lobe] - 1
             cell = np.minimum((draw[lobe, 1:2] > rising[which]).sum(axis=1), cells - 1)
-            cosine[lobe] = np.cos(((cell + draw[lobe, 2]) / cells) ** 2 * np.pi / 2)
+            rest = (draw[lobe, 1] - start[which, cell]) * cells
+            within = rest / np.maximum(self.density[which, cell], 1e-300)
+            u = (cell + np.clip(within, 0.0, 1.0)) / cells
+            cosine[lobe] = np.cos(u**2 * np.pi / 2)
         return by_half_vector(normal, view, cosine, turn, lobe)
 
     def pdf(self, mix: Array, normal: Array, view: Array, towards: Array) -> Array:

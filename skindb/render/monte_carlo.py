@@ -292,10 +292,12 @@ class _Painter:
         view = hits.view
         values = np.zeros((len(view.pixel), 3))
         mix = self.lobes.mix(hits.points.parameters)
-        draw = stratified(view, 7, rng)
+        lobe = np.concatenate(
+            [stratified(view, rng)[:, :1], stratified(view, rng)], axis=1
+        )
         drawn = (
-            environment.sample(draw[:, :3]),
-            self.lobes.sample(mix, view.normal, view.towards, draw[:, 3:]),
+            environment.sample(stratified(view, rng)),
+            self.lobes.sample(mix, view.normal, view.towards, lobe),
         )
         for sampler, towards in enumerate(drawn):
             above = np.flatnonzero(np.einsum("nc,nc->n", towards, view.normal) > 0)
@@ -373,7 +375,7 @@ class _Painter:
         tangent, second = tangents(normals)
         for i in range(VERTEX_SAMPLES):
             if i % 2:
-                towards = environment.sample(rng.random((len(points), 3)))
+                towards = environment.sample(rng.random((len(points), 2)))
             else:
                 height = np.sqrt(rng.random(len(points)))
                 turn = 2 * np.pi * rng.random(len(points))
@@ -480,7 +482,7 @@ class LightChoice:
         )
         cell = (x * CELLS + y) * CELLS + z
         # one offset for the lights of a hit, which spreads them over the sum
-        start = stratified(view, 1, rng)[:, 0]
+        start = stratified(view, rng)[:, 0]
         drawn = []
         for i in range(LIGHTS_PER_RAY):
             place = cell + (start + i) / LIGHTS_PER_RAY
@@ -493,17 +495,25 @@ class LightChoice:
         return drawn
 
 
-def stratified(view: View, dimensions: int, rng: np.random.Generator) -> Float:
-    """Uniform numbers (n, dimensions), stratified over the rays of each pixel (Latin
-    hypercube, McKay et al. 1979).
+def stratified(view: View, rng: np.random.Generator) -> Float:
+    """Uniform numbers (n, 2), stratified over the rays of each pixel: in cells of the
+    square, and in rows and columns of as many as there are rays (Chiu et al. 1994).
     """
-    rays = view.samples**2
+    side = view.samples
     which, row = np.unique(view.pixel, return_inverse=True)
-    out = np.empty((len(view.pixel), dimensions))
-    for k in range(dimensions):
-        order = rng.random((len(which), rays), np.float32).argsort(axis=1)
-        out[:, k] = (order[row, view.ray] + rng.random(len(view.pixel))) / rays
-    return out
+    shape = (len(which), side, side)
+    order = _shuffled((len(which), side**2), rng)[row, view.ray]
+    across, down = np.divmod(order, side)
+    # within the cells, each row and column of which gets one ray
+    columns = across * side + _shuffled(shape, rng)[row, across, down]
+    rows = down * side + _shuffled(shape, rng)[row, down, across]
+    place = np.stack([columns, rows], axis=1)
+    return np.asarray((place + rng.random(place.shape)) / side**2)
+
+
+def _shuffled(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.intp]:
+    """Random orders along the last axis."""
+    return rng.random(shape, np.float32).argsort(axis=-1)
 
 
 def points_on_discs(

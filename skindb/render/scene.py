@@ -390,16 +390,16 @@ class Environment:
 
     def sample(self, draw: Float) -> Float:
         """Unit directions (n, 3) drawn in proportion to luminance, from uniform numbers
-        (n, 3) in [0, 1).
+        (n, 2) in [0, 1).
+
+        The first runs through the texels from the brightest to the darkest, so that
+        stratified numbers share out the rays between a sun and the sky.
         """
-        place = np.searchsorted(
-            self._rising, draw[:, 0] * self._rising[-1], side="right"
-        )
-        texel = np.minimum(place, len(self._rising) - 1)
         height, width, _ = self.radiance.shape
-        row, column = np.divmod(texel, width)
-        across = draw[:, 1]
-        down = draw[:, 2]
+        order, rising = self._rising
+        place, across = _inverted(rising, draw[:, 0])
+        row, column = np.divmod(order[place], width)
+        down = draw[:, 1]
         top = np.cos(np.pi * row / height)
         bottom = np.cos(np.pi * (row + 1) / height)
         cosine = top + down * (bottom - top)
@@ -428,5 +428,20 @@ class Environment:
         return np.asarray(power / power.sum())
 
     @cached_property
-    def _rising(self) -> Float:
-        return np.cumsum(self._probability)
+    def _rising(self) -> tuple[NDArray[np.int64], Float]:
+        """Texels (h w,) from the brightest, and their cumulative probability."""
+        brightness = self._probability / self._solid_angle
+        order = np.argsort(-brightness, kind="stable")
+        rising = np.cumsum(self._probability[order])
+        return order, rising / rising[-1]
+
+
+def _inverted(rising: Float, level: Float) -> tuple[NDArray[np.int64], Float]:
+    """Indices (n,) of the steps of a cumulative sum that contain levels (n,), and the
+    fractions of these steps below them.
+    """
+    last = len(rising) - 1
+    index = np.minimum(np.searchsorted(rising, level, side="right"), last)
+    below = np.where(index > 0, rising[index - 1], 0.0)
+    step = np.maximum(rising[index] - below, 1e-300)
+    return index, np.clip((level - below) / step, 0.0, 1.0)

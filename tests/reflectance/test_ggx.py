@@ -316,7 +316,7 @@ def test_sampler__density_integrates_to_one_and_weights_have_the_albedo_as_mean(
     view = np.tile(unit(np.array([0.5, 0.1, 0.8])), (n, 1))
     normal = np.tile([0.0, 0.0, 1.0], (n, 1))
     mix = sampler.mix(np.tile([1.0, 0.3], (n, 1)))
-    towards = sampler.sample(mix, normal, view, rng.random((n, 4)))
+    towards = sampler.sample(mix, normal, view, rng.random((n, 3)))
     density = sampler.pdf(mix, normal, view, towards)
     up = towards[:, 2] > 0
     values = np.zeros(n)

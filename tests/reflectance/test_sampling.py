@@ -40,7 +40,7 @@ def test_sample__has_the_stated_density(weights, tilt):
         [np.sin(np.radians(tilt)), 0.0, np.cos(np.radians(tilt))], (count, 3)
     )
     mix = sampler.mix(np.broadcast_to(weights, (count, 3)))
-    drawn = sampler.sample(mix, normal, view, rng.random((count, 4)))
+    drawn = sampler.sample(mix, normal, view, rng.random((count, 3)))
     np.testing.assert_allclose(np.linalg.norm(drawn, axis=1), 1, atol=1e-12)
 
     # cells of equal solid angle over the upper hemisphere; the density is integrated on
@@ -101,7 +101,7 @@ def test_sample__weights_integrate_the_brdf():
         return 100 * np.clip(h[:, 2], 0, 1) ** 1000 * np.maximum(towards[:, 2], 0)
 
     mix = sampler.mix(np.broadcast_to([0.0, 0.0, 1.0], (count, 3)))
-    drawn = sampler.sample(mix, normal, view, rng.random((count, 4)))
+    drawn = sampler.sample(mix, normal, view, rng.random((count, 3)))
     up = drawn[:, 2] > 0
     value = np.zeros(count)
     value[up] = lobe(drawn[up]) / sampler.pdf(mix[up], normal[up], view[up], drawn[up])

@@ -274,7 +274,7 @@ def test_render__the_same_seed_gives_the_same_picture() -> None:
 def test_environment__draws_by_its_density() -> None:
     sky = SKY.environment
     count = 200_000
-    drawn = sky.sample(np.random.default_rng(2).random((count, 3)))
+    drawn = sky.sample(np.random.default_rng(2).random((count, 2)))
     np.testing.assert_allclose(np.linalg.norm(drawn, axis=1), 1, atol=1e-12)
     found = np.bincount(sky._texel(drawn), minlength=8 * 16)
     edge = np.cos(np.pi * np.arange(9) / 8)
