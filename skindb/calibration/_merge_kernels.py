@@ -4,12 +4,12 @@ the GIL released.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.jit import kernel
+from skindb.jit import kernel, single
 from skindb.types import (
     ByteMatrix,
     ByteVector,
@@ -132,6 +132,30 @@ def develop(
             total[k] = np.float32(model.photon) * positive
         _average(row.signal, row.noise, model.seconds, total, row.weights[:size])
         _finish(y, start, total, row.time, row.above, model, radiance, flag)
+
+
+@kernel
+def develop_linear(
+    frame: NDArray[Any], spans: IntMatrix, radiance: Cube32, flag: ByteMatrix
+) -> None:
+    """Radiance (h, w, 3) and flags (h, w) of linear values (h, w, 3) within spans (h, 2),
+    as `develop` writes them; NaN and SATURATED where a channel is not finite.
+    """
+    for y in range(flag.shape[0]):
+        start = spans[y, 0]
+        end = max(spans[y, 0], spans[y, 1])
+        flag[y, :start] = SATURATED
+        flag[y, end:] = SATURATED
+        for x in range(start, end):
+            red = single(frame[y, x, 0])
+            green = single(frame[y, x, 1])
+            blue = single(frame[y, x, 2])
+            # NaN unless all three are finite
+            lost = (red - red) + (green - green) + (blue - blue)
+            radiance[y, x, 0] = red + lost
+            radiance[y, x, 1] = green + lost
+            radiance[y, x, 2] = blue + lost
+            flag[y, x] = OK if lost == ZERO else SATURATED
 
 
 @kernel

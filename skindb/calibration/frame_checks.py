@@ -16,6 +16,7 @@ from skindb.calibration.radiance import (
     relative_exposure,
 )
 from skindb.errors import Fault, InputError
+from skindb.format._frame_kernels import finite_range
 from skindb.format.dome import DomeRecord
 from skindb.format.fields import MAX_MAGNITUDE
 from skindb.format.frames import Digests, Frame, read_frame
@@ -252,9 +253,7 @@ def _linear_fault(place: str, frame: Frame) -> Fault | None:
     """Fault of merged radiance that is negative or constant; zero is allowed, for
     lights behind the face.
     """
-    finite = np.isfinite(frame)
-    low = float(np.min(frame, where=finite, initial=np.inf))
-    high = float(np.max(frame, where=finite, initial=-np.inf))
+    low, high, positive = _finite_range(frame)
     rule = "an OpenEXR frame must hold the radiance of a photograph"
     if not low <= high:
         finding = "no finite value"
@@ -263,15 +262,35 @@ def _linear_fault(place: str, frame: Frame) -> Fault | None:
         finding = f"{low:.3g} to {high:.3g}"
     elif low == high != 0:
         finding = f"{low:.3g} everywhere"
-    elif low < 0 and float((frame > 0).mean()) < MIN_POSITIVE_FRACTION:
+    elif low < 0 and positive < MIN_POSITIVE_FRACTION:
         finding = f"values from {low:.3g} to {high:.3g}, nearly all negative"
     else:
         return None
     return Fault(place, rule, finding, "merge the exposures of this view again")
 
 
+def _finite_range(frame: Frame) -> tuple[float, float, float]:
+    """Smallest and largest finite value of floats, infinite ones if there is none, and
+    the fraction of positive values.
+    """
+    integer = np.dtype(f"i{frame.dtype.itemsize}")
+    sign = int(np.iinfo(integer).max)
+    infinite = int(np.array(np.inf, frame.dtype).view(integer))
+    bits = np.ascontiguousarray(frame).view(integer).reshape(-1)
+    *ends, positive = finite_range(bits, sign, infinite)
+    low, high = (
+        float(np.array(end if end >= 0 else end ^ sign, integer).view(frame.dtype))
+        for end in ends
+    )
+    return low, high, positive / max(bits.size, 1)
+
+
 def highest_value(merger: FrameMerger, frames: Sequence[Frame]) -> tuple[float, bool]:
-    """Highest value of the longest exposure of a view, and whether the picture is cut off there."""
+    """Highest value of the longest exposure of a view, and whether the picture is cut off
+    there; NaN for linear radiance.
+    """
+    if merger.camera.sensor.kind.bits == 0:
+        return float("nan"), False
     values = _thinned(frames[int(np.argmax(merger.seconds))])
     highest = float(values.max())
     near = values > highest - 0.1 * (highest - merger.camera.sensor.black)
@@ -293,7 +312,7 @@ def level_notes(dome: DomeRecord, highest: Float64, clipped: Mask) -> list[str]:
     for c, camera in enumerate(dome.cameras):
         sensor = camera.sensor
         values = highest[np.isfinite(highest[:, c]), c]
-        if sensor.kind.bits == 0 or not len(values):
+        if not len(values):
             continue
         top = float(values.max())
         fraction = (top - sensor.black) / (sensor.white - sensor.black)

@@ -16,11 +16,13 @@ from skindb.calibration._merge_kernels import (
     SATURATED,
     ExposureModel,
     develop,
+    develop_linear,
 )
 from skindb.errors import Fault, attempt
 from skindb.format.dome import CameraRecord, DomeRecord
 from skindb.format.frames import Digests, Frame, filled, read_frames
 from skindb.format.sensor import SensorRecord
+from skindb.jit import sample_bits
 from skindb.types import Bytes, Float32, Float64, Index, Mask
 
 # number of radiances up to the white level at which the linear model is fitted to the
@@ -57,16 +59,16 @@ class FrameMerger:
         its radiance; one with none is saturated, dark, or lies in a gap between the
         exposures.
         """
-        if self.camera.sensor.kind.bits == 0:
-            radiance, _, flag = _linear(frames)
-            if usable is not None:
-                usable[:] = 2
-            return radiance, flag
         height, width, _ = frames[0].shape
         radiance = np.empty((height, width, 3), np.float32)
         flag = np.empty((height, width), np.uint8)
         if spans is None:
             spans = np.tile(np.array([0, width]), (height, 1))
+        if self.camera.sensor.kind.bits == 0:
+            develop_linear(sample_bits(_only(frames)), spans, radiance, flag)
+            if usable is not None:
+                usable[:] = 2
+            return radiance, flag
         count = np.empty((0, 0), np.uint8) if usable is None else usable
         develop(tuple(frames), self._exposure_model, spans, radiance, flag, count)
         return radiance, flag
@@ -282,13 +284,17 @@ def radiance_floor(sensor: SensorRecord, exposures: Mapping[str, float]) -> floa
 
 
 def _linear(frames: list[Frame]) -> tuple[Image, Image, Bytes]:
-    # a single one, as `read_dome` requires
-    (frame,) = frames
-    radiance = frame.astype(np.float32)
+    radiance = _only(frames).astype(np.float32)
     lost = ~np.isfinite(radiance).all(axis=-1)
     radiance[lost] = np.nan
     flag = np.where(lost, SATURATED, OK).astype(np.uint8)
     return radiance, np.zeros_like(radiance), flag
+
+
+def _only(frames: Sequence[Frame]) -> Frame:
+    """The frame of linear radiance, a single one, as `read_dome` requires."""
+    (frame,) = frames
+    return frame
 
 
 def relative_exposure(

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from skindb.elementwise import thread_count
 from skindb.errors import Fault, InputError, attempt, input_error, require
 from skindb.files import open_regular, private_file, read_regular
+from skindb.format._frame_kernels import unpack_lines
 from skindb.format.fields import IDENTIFIER, Fields, short
 from skindb.limits import (
     MAX_EXPOSURES,
@@ -38,16 +39,19 @@ from skindb.limits import (
     MAX_RECHECKED_BYTES,
 )
 from skindb.render.image import write_exr
+from skindb.types import Index
 
-Frame = NDArray[Any]  # (h, w, 3) uint8, uint16 or float32
+Frame = NDArray[Any]  # (h, w, 3) uint8, uint16, float16 or float32
 Header = tuple[int, int, int, np.dtype[Any]]  # width, height, channels, type
-Codec = tuple[Callable[[Path, BinaryIO], Header], Callable[[Path, bytes], Frame]]
+Codec = tuple[Callable[[BinaryIO], Header], Callable[[Path, bytes], Frame]]
 Digests = dict[Path, str]  # sha256 of the bytes that were decoded
 PNG_HEAD = b"\x89PNG\r\n\x1a\n"
 PNG_TAIL = b"IEND\xaeB`\x82"
 PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # colour type of IHDR
 # lines per chunk, by compression
 EXR_LINES = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}
+EXR_ZIPPED = (2, 3)  # compressions ZIPS and ZIP
+EXR_HALF = 1  # type of a channel
 # of a file; a count far above R, G, B, alpha and depth indicates damage
 MAX_CHANNELS = 16
 CURE = "copy the file from the camera again"
@@ -86,7 +90,7 @@ class FrameKind:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Type of the pixels: float32, uint8 or uint16."""
+        """Type of the pixels: uint8, uint16, or float32, which includes half floats."""
         return np.dtype(
             "float32" if self.bits == 0 else "uint8" if self.bits <= 8 else "uint16"
         )
@@ -115,7 +119,7 @@ def header_faults(path: Path, kind: FrameKind, key: str) -> list[Fault]:
     """
     place = f"{path} ({key})"
     faults = list[Fault]()
-    header = attempt(faults, lambda: _header(path), where=place)
+    header = attempt(faults, lambda: _file_header(path), where=place)
     if header is None:
         return faults
     width, height, channels, dtype = header
@@ -136,23 +140,26 @@ def header_faults(path: Path, kind: FrameKind, key: str) -> list[Fault]:
 
 def frame_size(path: Path) -> tuple[int, int] | None:
     """Width and height according to the header; None if there is none."""
-    header = attempt([], lambda: _header(path))
+    header = attempt([], lambda: _file_header(path))
     return None if header is None else header[:2]
 
 
-def _header(path: Path) -> Header:
-    """Width, height, channels and type of a frame; the file must be regular and within
-    the size limit.
-    """
-    place = str(path)
+def _file_header(path: Path) -> Header:
+    """Header of a file, which must be regular and within the size limit."""
     try:
         with _whole_image(path), open_regular(path, MAX_FRAME_BYTES) as stream:
-            width, height, channels, dtype = _codec(path)[0](path, stream)
+            return _header(path, stream)
     except OSError as error:
         finding = error.strerror or str(error)
         cure = "check its permissions and the disk"
-        fault = Fault(place, "a frame must be readable", finding, cure)
+        fault = Fault(str(path), "a frame must be readable", finding, cure)
         raise InputError(fault) from None
+
+
+def _header(path: Path, stream: BinaryIO) -> Header:
+    """Width, height, channels and type of a frame."""
+    place = str(path)
+    width, height, channels, dtype = _codec(path)[0](stream)
     require(channels <= MAX_CHANNELS, place, RGB_RULE, f"{channels} channels", RGB_CURE)
     require(
         min(width, height) > 0 and width * height <= MAX_FRAME_PIXELS,
@@ -192,7 +199,8 @@ def read_frame(
     Returns
     -------
     ndarray
-        (h, w, 3) uint8 or uint16 values of the file, or float32 radiance of OpenEXR.
+        (h, w, 3) uint8 or uint16 values of the file, or float16 or float32 radiance of
+        OpenEXR.
 
     Raises
     ------
@@ -201,13 +209,15 @@ def read_frame(
     """
     with _whole_image(path):
         decode = _codec(path)[1]
-        _header(path)  # checks the size before memory for it is allocated
         content = read_regular(path, MAX_FRAME_BYTES)
+        # checks the size before memory for it is allocated
+        _header(path, io.BytesIO(content))
         frame: Frame = decode(path, content)
     shape = frame.shape[:2] if kind is None else (kind.height, kind.width)
     dtype = frame.dtype if kind is None else kind.dtype
+    same_type = frame.dtype in (dtype, np.float16 if dtype == np.float32 else dtype)
     require(
-        frame.shape == (*shape, 3) and frame.dtype == dtype,
+        frame.shape == (*shape, 3) and same_type,
         str(path),
         f"a frame must be {shape[1]} x {shape[0]} with R, G, B of {dtype}",
         f"an array of {' x '.join(map(str, frame.shape))} {frame.dtype}",
@@ -251,7 +261,7 @@ def write_frame(path: Path, frame: Frame) -> None:
         raise ValueError(f"frames are .png, .tif or .exr, not {suffix!r}")
 
 
-def _png_header(_: Path, stream: BinaryIO) -> Header:
+def _png_header(stream: BinaryIO) -> Header:
     head = stream.read(33)
     size = stream.seek(0, io.SEEK_END)
     stream.seek(max(size - len(PNG_TAIL), 0))
@@ -283,7 +293,7 @@ def _png_ends(stream: BinaryIO, size: int) -> bool:
     return False
 
 
-def _tiff_header(_: Path, stream: BinaryIO) -> Header:
+def _tiff_header(stream: BinaryIO) -> Header:
     try:
         with tifffile.TiffFile(stream) as file:
             page = file.pages[0]
@@ -296,18 +306,39 @@ def _tiff_header(_: Path, stream: BinaryIO) -> Header:
     raise UnreadableError(DAMAGED)
 
 
-def _exr_header(path: Path, stream: BinaryIO) -> Header:
+@dataclass(frozen=True)
+class _ExrBlocks:
+    """Blocks of lines of a scan-line OpenEXR file with one part."""
+
+    lines: int  # of a block
+    offsets: list[int]  # of the blocks in the file, from top to bottom
+    # of compressed half floats, the channels in each line; otherwise empty
+    channels: list[str]
+
+
+def _exr_part(stream: BinaryIO) -> Any:
+    """First part of a file, with its header alone."""
     try:
-        file = OpenEXR.File(str(path), separate_channels=True, header_only=True)
-        part = file.parts[0]
+        file = OpenEXR.File(stream, separate_channels=True, header_only=True)
+        return file.parts[0]
     except (ValueError, RuntimeError, IndexError):
         raise UnreadableError(DAMAGED) from None
+
+
+def _exr_size(part: Any) -> tuple[int, int]:
+    """Width and height of a part."""
     low, high = (np.asarray(corner) for corner in part.header["dataWindow"])
     width, height = (high - low + 1).tolist()
+    return width, height
+
+
+def _exr_header(stream: BinaryIO) -> Header:
+    part = _exr_part(stream)
+    width, height = _exr_size(part)
     try:
-        _require_chunks(stream, height)
+        _exr_blocks(stream, height)
         names = {channel.name for channel in part.header["channels"]}
-    except (struct.error, IndexError, UnicodeDecodeError):
+    except (struct.error, ValueError, IndexError):
         # the library also opens incomplete headers
         raise UnreadableError(DAMAGED) from None
     if len(names) > MAX_CHANNELS:
@@ -316,9 +347,9 @@ def _exr_header(path: Path, stream: BinaryIO) -> Header:
     return width, height, channels, np.dtype("float32")
 
 
-def _require_chunks(stream: BinaryIO, height: int) -> None:
-    """Require that the last chunk of a scan-line file ends inside it; the library only
-    prints a message.
+def _exr_blocks(stream: BinaryIO, height: int) -> _ExrBlocks | None:
+    """Blocks of a file, of which the last must end inside it, because the library only
+    prints a message; None for tiled, deep and multi-part files.
     """
     size = stream.seek(0, os.SEEK_END)
 
@@ -329,18 +360,24 @@ def _require_chunks(stream: BinaryIO, height: int) -> None:
 
     offset = 8
     lines = 0
+    channels = b""
+    zipped = False
     while (attribute := content(offset, 600))[:1] != b"\0":
         name, _, rest = attribute.partition(b"\0")
         kind = rest.partition(b"\0")[0]
         value = offset + len(name) + len(kind) + 6
-        if name == b"compression":
-            lines = EXR_LINES.get(content(value, 1)[0], 0)
         # unsigned: no step back
-        offset = value + int(struct.unpack("<I", content(value - 4, 4))[0])
+        length = int(struct.unpack("<I", content(value - 4, 4))[0])
+        if name == b"compression":
+            compression = content(value, 1)[0]
+            lines = EXR_LINES.get(compression, 0)
+            zipped = compression in EXR_ZIPPED
+        elif name == b"channels":
+            channels = content(value, min(length, MAX_CHANNELS * 300))
+        offset = value + length
     flags = content(5, 1)[0]
-    # tiled, deep and multi-part files are left to the decoder
     if not lines or flags & 0b11010:
-        return
+        return None
     count = -(-height // lines)
     table = content(offset + 1, 8 * count)
     if not 0 < 8 * count == len(table):
@@ -351,6 +388,23 @@ def _require_chunks(stream: BinaryIO, height: int) -> None:
         end += int.from_bytes(content(end - 4, 4), "little")
     if end > size or int(offsets.min()) == 0:
         raise UnreadableError(DAMAGED)
+    return _ExrBlocks(
+        lines, offsets.tolist(), _half_channels(channels) if zipped else []
+    )
+
+
+def _half_channels(content: bytes) -> list[str]:
+    """Names of channels of half floats in full resolution; empty if one is of another kind."""
+    names = []
+    while content[:1] not in (b"", b"\0"):
+        name, _, rest = content.partition(b"\0")
+        kind, _, *sampling = struct.unpack("<iIii", rest[:16])
+        if kind != EXR_HALF or sampling != [1, 1]:
+            return []
+        names.append(name.decode())
+        content = rest[16:]
+    # in this order they are in a line
+    return names if names == sorted(set(names)) else []
 
 
 def _decode_png(_: Path, content: bytes) -> Frame:
@@ -367,9 +421,52 @@ def _decode_tiff(_: Path, content: bytes) -> Frame:
         raise UnreadableError(DAMAGED) from None
 
 
-def _decode_exr(path: Path, _: bytes) -> Frame:
+def _decode_exr(path: Path, content: bytes) -> Frame:
+    stream = io.BytesIO(content)
+    part = _exr_part(stream)
+    width, height = _exr_size(part)
+    blocks = _exr_blocks(stream, height)
+    if blocks is None or not set(blocks.channels).issuperset("RGB"):
+        return _decode_any_exr(path)
+    order = np.array([blocks.channels.index(name) for name in "RGB"])
+    first = int(part.header["dataWindow"][0][1])
+    out = np.empty((height, width, 3), np.uint16)
+    buffer = np.empty((blocks.lines, len(blocks.channels), width), np.uint16)
+    for offset, top in zip(blocks.offsets, range(0, height, blocks.lines), strict=True):
+        lines = out[top : top + blocks.lines]
+        line, size = struct.unpack_from("<iI", content, offset)
+        block = content[offset + 8 : offset + 8 + size]
+        if line != first + top or not _unpack(
+            block, order, buffer[: len(lines)], lines
+        ):
+            raise UnreadableError(DAMAGED)
+    return out.view(np.float16)
+
+
+def _unpack(block: bytes, order: Index, buffer: NDArray[np.uint16], out: Frame) -> bool:
+    """Write the bits (lines, w, 3) of a zipped block of half floats, whose channels in
+    this order are R, G, B; False if it is damaged.
+
+    `buffer` (lines, channel, w) is overwritten.
+    """
+    if len(block) == buffer.nbytes:  # stored as it is, as it does not shrink
+        values = np.frombuffer(block, "<u2").reshape(buffer.shape)
+        out[:] = values[:, order].transpose(0, 2, 1)
+        return True
+    inflated = buffer.reshape(-1).view(np.uint8)
     try:
-        # `OpenEXR.File` prints a warning about damaged pixels
+        size = len(imagecodecs.deflate_decode(block, out=inflated.data))
+    except RuntimeError:
+        return False
+    unpack_lines(inflated, order, out)
+    return bool(size == buffer.nbytes)
+
+
+def _decode_any_exr(path: Path) -> Frame:
+    """Channels of any OpenEXR file, by a function that keeps other threads waiting;
+    `OpenEXR.File` prints a warning about damaged pixels.
+    """
+    try:
         file = OpenEXR.InputFile(str(path))
         window = file.header()["dataWindow"]
         planes = file.channels("RGB", FLOAT)

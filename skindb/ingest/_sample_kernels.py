@@ -10,7 +10,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from skindb.calibration._merge_kernels import DARK, OK, SATURATED
-from skindb.jit import inline_kernel, kernel
+from skindb.jit import inline_kernel, kernel, single
 from skindb.types import (
     BoolVector,
     ByteMatrix,
@@ -274,6 +274,77 @@ def tally(outcome: ByteVector, counts: IntMatrix32) -> int:
             counts[OK, i] += outcome[i] == SINGLE
             usable += outcome[i] == OK or outcome[i] == SINGLE
     return usable
+
+
+@kernel
+def view_levels(
+    samples: Halves, outcome: ByteVector, bright: float
+) -> tuple[int, bool, float, float]:
+    """Number of usable samples of a view, whether one of their channels is positive,
+    median of the channels, and fraction with a channel above `bright`.
+
+    `samples` (3, n) are bits of half floats; NaN, beyond half precision, counts as
+    infinite. The median is found by counting the values in their order.
+    """
+    counts = np.zeros(1 << 16, np.int32)
+    usable = 0
+    too_bright = 0
+    for i in range(outcome.shape[0]):
+        if outcome[i] != OK and outcome[i] != SINGLE:
+            continue
+        usable += 1
+        above = False
+        for c in range(3):
+            bits = samples[c, i]
+            # in the order of the values: negative ones reversed, below the others
+            counts[0xFFFF - bits if bits & 0x8000 else 0x8000 + bits] += 1
+            above = above or not single(bits) <= bright
+        too_bright += above
+    lit = bool(counts[0x8001:].any())
+    if usable == 0:
+        return 0, lit, np.nan, 0.0
+    total = 0
+    below = -1
+    middle = 0.0
+    for k in range(counts.shape[0]):
+        total += counts[k]
+        if below < 0 and 2 * total >= 3 * usable:
+            below = k
+        if 2 * total > 3 * usable:
+            middle = 0.5 * (_ordered_half(below) + _ordered_half(k))
+            break
+    return usable, lit, middle, too_bright / usable
+
+
+@kernel
+def _ordered_half(place: int) -> float:
+    """Value of the half float at this place in the order of all."""
+    bits = place - 0x8000 if place >= 0x8000 else 0xFFFF - place
+    value = np.float64(single(np.uint16(bits)))
+    return np.inf if np.isnan(value) else value
+
+
+@kernel
+def block_means(image: Cube32, factor: int, out: Cube32) -> None:
+    """Means (h // factor, w // factor, c) of square blocks of a picture (h, w, c); NaN
+    and inf count as its maximum, which is at least 0, and -inf as 0.
+    """
+    height, width, channels = out.shape
+    missing = np.zeros((height, width, channels), np.float32)
+    top = np.float32(0.0)
+    out[:] = 0.0
+    for y in range(height * factor):
+        v = y // factor
+        for u in range(width):
+            for x in range(u * factor, (u + 1) * factor):
+                for c in range(channels):
+                    value = image[y, x, c]
+                    if not value < np.inf:
+                        missing[v, u, c] += 1.0
+                    elif value > -np.inf:
+                        out[v, u, c] += value
+                        top = max(top, value)
+    out[:] = (out + missing * top) / factor**2
 
 
 @kernel

@@ -7,9 +7,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
-from skindb.errors import Fault, require
+from skindb.errors import Fault
 from skindb.format.dome import DomeRecord
 from skindb.ingest.consistency import MAX_OFFSET_MM, MIN_AGREEMENT, Calibration
 from skindb.types import Float64
@@ -145,38 +144,6 @@ def light_notes(
         )
         for j, ratio in _beyond(ratios, limit)
     ]
-
-
-def view_median(samples: NDArray[np.float16]) -> float:
-    """Median of the usable samples (3, n) of a view, whose NaN, beyond half precision,
-    count as infinite.
-    """
-    if samples.shape[1] < MIN_MEDIAN_SAMPLES:
-        return float("nan")
-    values = samples.astype(np.float64)
-    return float(np.median(np.where(np.isnan(values), np.inf, values)))
-
-
-def bright_fraction(samples: NDArray[np.float16]) -> float:
-    """Fraction of the usable samples (3, n) of a view that are too large for a surface;
-    NaN: beyond half precision.
-    """
-    if samples.shape[1] < MIN_MEDIAN_SAMPLES:
-        return 0.0
-    return float((~(samples <= MAX_SAMPLE)).any(axis=0).mean())
-
-
-def require_lit(where: str, radiance: NDArray[np.float32], count: int) -> None:
-    """Require a view whose usable pixels (n, 3), at `count` surfels, are not all zero
-    or negative.
-    """
-    require(
-        count < MIN_MEDIAN_SAMPLES or (radiance > 0).any(),
-        where,
-        "a frame must be bright where its light reaches the face",
-        f"none at {count} surfels",
-        "copy the frame from the camera again",
-    )
 
 
 def _relative(intensity: Float64) -> Float64:

@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.calibration._merge_kernels import OK, SATURATED
+from skindb.calibration._merge_kernels import SATURATED
 from skindb.calibration.frame_checks import checked_view, highest_value
 from skindb.calibration.irradiance import light_falloff
 from skindb.calibration.radiance import (
@@ -22,24 +22,23 @@ from skindb.calibration.radiance import (
     radiance_noise,
     vignette_gain,
 )
-from skindb.errors import Fault, InputError, attempt
+from skindb.errors import Fault, InputError, attempt, require
 from skindb.format.dome import CameraRecord, DomeRecord
 from skindb.format.frames import Digests, Frame
 from skindb.geometry._mesh_kernels import grown
 from skindb.ingest._sample_kernels import (
-    SINGLE,
     MergedView,
     PointLight,
     gather,
     pixel_counts,
     pixel_spans,
+    view_levels,
 )
 from skindb.ingest.consistency import Calibration, CalibrationCheck, Pair
 from skindb.ingest.faults import (
-    bright_fraction,
+    MAX_SAMPLE,
+    MIN_MEDIAN_SAMPLES,
     calibration_faults,
-    require_lit,
-    view_median,
 )
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet
@@ -292,17 +291,24 @@ class _Sampler:
         )
         radiance, flag, _ = merged
         if is_kept:
-            self.spool.keep(f"photograph-{j}-{c}", _without_saturated(radiance, flag))
+            _lose_saturated(radiance, flag)
+            self.spool.keep(f"photograph-{j}-{c}", radiance)
         if check is not None:
-            reduced = check.reduce(c, _without_saturated(radiance, flag))
-            self.spool.keep(f"calibration-{j}-{c}", reduced)
+            _lose_saturated(radiance, flag)
+            self.spool.keep(f"calibration-{j}-{c}", check.reduce(c, radiance))
         samples, outcome = self._gathered(merged, shot, surfels, j)
-        usable = samples[:, (outcome == OK) | (outcome == SINGLE)].view(np.float16)
-        place = f"{self.dome.file}[frames], camera {merger.camera.id}, light {light.id}"
-        require_lit(place, radiance[flag == OK], usable.shape[1])
+        count, lit, median, bright = view_levels(samples, outcome, MAX_SAMPLE)
         levels = self.levels
-        levels.median[j, c] = view_median(usable)
-        levels.bright[j, c] = bright_fraction(usable)
+        if count >= MIN_MEDIAN_SAMPLES:
+            require(
+                lit,
+                f"{self.dome.file}[frames], camera {merger.camera.id}, light {light.id}",
+                "a frame must be bright where its light reaches the face",
+                f"none at {count} surfels",
+                "copy the frame from the camera again",
+            )
+            levels.median[j, c] = median
+            levels.bright[j, c] = bright
         levels.highest[j, c], levels.clipped[j, c] = highest_value(merger, frames)
         names = {str(path): digest for path, digest in digests.items()}
         self.spool.put(j, c, samples, outcome, names)
@@ -356,7 +362,9 @@ def checked_pictures(
         j, c = pair
         merger = mergers[dome.cameras[c].id]
         frames = checked_view(dome, dome.lights[j].id, merger)
-        return check.reduce(c, _without_saturated(*merger.merge(frames)))
+        radiance, flag = merger.merge(frames)
+        _lose_saturated(radiance, flag)
+        return check.reduce(c, radiance)
 
     ordered = sorted(pairs)
     call = partial(attempt, faults)
@@ -370,9 +378,9 @@ def checked_pictures(
     }
 
 
-def _without_saturated(radiance: Image, flag: NDArray[np.uint8]) -> Image:
-    """The radiance, with NaN at saturated pixels."""
-    return np.where((flag == SATURATED)[..., None], np.float32(np.nan), radiance)
+def _lose_saturated(radiance: Image, flag: NDArray[np.uint8]) -> None:
+    """Set saturated pixels to NaN."""
+    radiance[flag == SATURATED] = np.nan
 
 
 def _evaluated(check: CalibrationCheck, spool: Spool) -> Calibration:

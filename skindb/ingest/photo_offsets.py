@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from skindb.ingest._sample_kernels import interpolate
+from skindb.ingest._sample_kernels import block_means, interpolate
 from skindb.numerics.statistics import correlation, robust_deviation
 from skindb.types import Float64, Mask
 
@@ -96,12 +96,10 @@ def reduced(image: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
     """Means (h // factor, w // factor, c) of square blocks of a picture (h, w, c),
     whose NaN count as its maximum.
     """
-    h, w = (size // factor * factor for size in image.shape[:2])
-    cropped = image[:h, :w]
-    top = float(np.nanmax(cropped, initial=0.0)) if np.isfinite(cropped).any() else 0.0
-    filled = np.nan_to_num(cropped, nan=top, posinf=top, neginf=0.0)
-    blocks = filled.reshape(h // factor, factor, w // factor, factor, -1)
-    return np.asarray(blocks.mean(axis=(1, 3)), np.float32)
+    height, width, channels = image.shape
+    out = np.empty((height // factor, width // factor, channels), np.float32)
+    block_means(image, factor, out)
+    return out
 
 
 def bilinear(image: Float64, pixels: Float64) -> Float64:

@@ -27,6 +27,7 @@ from sphere import (
 from spoil import D, P, edit, put
 
 from skindb.calibration.frame_checks import (
+    _finite_range,
     dark_pattern_fault,
     highest_value,
     level_notes,
@@ -655,3 +656,19 @@ def test_ingest_capture__dark_frames_upside_down_are_refused(capture_folder, tmp
         ingest_take(
             Database(tmp_path / "db"), capture_folder, spacing_mm=8.0, photographs=0
         )
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_finite_range__as_numpy(dtype):
+    rng = np.random.default_rng(1)
+    for low, high in ((-3, 5), (1, 2), (-2, -1), (0, 0)):
+        frame = rng.uniform(low, high, (5, 7, 3)).astype(dtype)
+        frame[0, 0] = np.nan, np.inf, -np.inf
+        frame[0, 1] = -np.nan
+        finite = frame[np.isfinite(frame)]
+        assert _finite_range(frame) == (
+            finite.min(),
+            finite.max(),
+            (finite > 0).sum() / frame.size,
+        )
+    assert _finite_range(np.full((2, 2, 3), np.nan, dtype)) == (np.inf, -np.inf, 0)

@@ -5,6 +5,7 @@ import io
 import tracemalloc
 
 import numpy as np
+import OpenEXR
 import pytest
 import tifffile
 
@@ -12,7 +13,7 @@ from skindb.errors import InputError
 from skindb.format.frames import (
     FrameKind,
     UnreadableError,
-    _require_chunks,
+    _exr_blocks,
     frame_size,
     header_faults,
     read_frame,
@@ -36,10 +37,55 @@ def test_read_frame__returns_what_was_written(tmp_path, name):
     kind = FrameKind(7, len(frame), bits)
     write_frame(tmp_path / name, frame)
     found = read_frame(tmp_path / name, kind)
-    assert found.dtype == kind.dtype
+    assert found.dtype == frame.dtype
     np.testing.assert_array_equal(found, frame)
     assert header_faults(tmp_path / name, kind, "frames") == []
     assert frame_size(tmp_path / name) == (7, len(frame))
+
+
+HALF = RNG.normal(0, 2, (37, 11, 3)).astype(np.float16)
+BITS = RNG.integers(0, 1 << 16, HALF.shape, np.uint16).view(np.float16)
+CHANNELS = {
+    "RGB": {"RGB": HALF},
+    "RGB that does not shrink": {"RGB": BITS},
+    "RGB that is constant": {"RGB": np.zeros_like(HALF)},
+    "RGBA": {"RGBA": np.concatenate([HALF, HALF[..., :1]], axis=-1)},
+    "depth of another type": {"RGB": HALF, "Z": np.ones((37, 11), np.float32)},
+    "depth": {"RGB": HALF, "Z": HALF[..., 0].copy()},
+    "green of another type": {
+        "R": HALF[..., 0].copy(),
+        "G": HALF[..., 1].astype(np.float32),
+        "B": HALF[..., 2].copy(),
+    },
+}
+
+
+@pytest.mark.parametrize("compression", ["NO", "RLE", "ZIPS", "ZIP", "PIZ", "DWAA"])
+def test_read_frame__openexr_as_its_library(tmp_path, compression):
+    """Zipped half floats are decoded here, so that other threads go on."""
+    path = tmp_path / "a.exr"
+    kind = getattr(OpenEXR, f"{compression}_COMPRESSION")
+    for channels in CHANNELS.values():
+        header = {"compression": kind, "type": OpenEXR.scanlineimage}
+        header["dataWindow"] = tuple(np.array([[3, -5], [13, 31]], np.int32))
+        OpenEXR.File(header, channels).write(str(path))
+        planes = OpenEXR.File(str(path), separate_channels=True).channels()
+        expected = np.stack([planes[name].pixels for name in "RGB"], axis=-1)
+        frame = read_frame(path)
+        np.testing.assert_array_equal(frame, expected)
+        halves = all(plane.pixels.dtype == np.float16 for plane in planes.values())
+        assert (frame.dtype == np.float16) == (halves and "ZIP" in compression)
+
+
+def test_read_frame__exchanged_lines_of_an_openexr_file_are_damage(tmp_path):
+    write_frame(tmp_path / "a.exr", HALF)
+    content = (tmp_path / "a.exr").read_bytes()
+    offsets = np.array(_exr_blocks(io.BytesIO(content), 37).offsets, "<u8")
+    exchanged = content.replace(offsets.tobytes(), offsets[[1, 0, 2]].tobytes())
+    assert exchanged != content
+    (tmp_path / "a.exr").write_bytes(exchanged)
+    with pytest.raises(InputError, match="cut off or damaged"):
+        read_frame(tmp_path / "a.exr")
 
 
 @pytest.mark.parametrize("name", FRAMES)
@@ -99,7 +145,7 @@ def test_header_faults__a_damaged_height_asks_for_no_table_larger_than_the_file(
 ):
     write_frame(tmp_path / "a.exr", FRAMES["half.exr"][0])
     with pytest.raises(UnreadableError, match="cut off"):
-        _require_chunks(io.BytesIO((tmp_path / "a.exr").read_bytes()), height)
+        _exr_blocks(io.BytesIO((tmp_path / "a.exr").read_bytes()), height)
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ from skindb.ingest._sample_kernels import (
     pixel_counts,
     pixel_spans,
     tally,
+    view_levels,
 )
 
 LIGHT = np.array([10.0, -20.0, 300.0])
@@ -317,3 +318,20 @@ def test_gather__samples_of_a_single_exposure():
     counts = np.zeros((4, 4), np.int32)
     assert tally(outcome, counts) == 4
     assert counts.tolist() == [[1] * 4, [0] * 4, [0] * 4, [1, 0, 1, 0]]
+
+
+def test_view_levels__as_numpy():
+    rng = np.random.default_rng(3)
+    for count in (1, 2, 7, 8):
+        samples = rng.normal(1, 3, (3, 20)).astype(np.float16)
+        outcome = np.full(20, NONE, np.uint8)
+        outcome[:count] = [OK, SINGLE] * (count // 2) + [OK] * (count % 2)
+        usable = samples[:, :count].astype(float)
+        levels = view_levels(samples.view(np.uint16), outcome, 2.0)
+        bright = (usable > 2).any(axis=0).mean()
+        assert levels == (count, (usable > 0).any(), np.median(usable), bright)
+    samples[:] = np.nan
+    assert view_levels(samples.view(np.uint16), outcome, 2.0) == (8, True, np.inf, 1)
+    samples[:] = -1
+    samples[:, :2] = -0.0
+    assert view_levels(samples.view(np.uint16), outcome, 2.0) == (8, False, -1, 0)

@@ -1,0 +1,82 @@
+"""Kernels of frames: from the inflated bytes of OpenEXR to values, and their range."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skindb.jit import kernel
+from skindb.types import ByteVector, IntVector
+
+Halves = np.ndarray[tuple[int, int, int], np.dtype[np.uint16]]  # bits of half floats
+Bits = NDArray[np.signedinteger]  # int16 or int32, the bits of half or single floats
+
+
+@kernel
+def unpack_lines(content: ByteVector, order: IntVector, out: Halves) -> None:
+    """Undo the byte predictor of OpenEXR for a block of lines of half floats.
+
+    Each byte is the difference to the one before, plus 128. The first half of them are
+    the lower bytes of all values, the second half the upper ones; both are summed in one
+    loop, because each sum has to wait for the one before.
+
+    Parameters
+    ----------
+    content
+        (2 n,) inflated bytes of n values, channel by channel in each line.
+    order
+        (3,) index of R, G, B among the channels of a line.
+    out
+        (lines, w, 3) uint16 output.
+    """
+    lines, width, _ = out.shape
+    channels = content.shape[0] // (2 * lines * width)
+    count = content.shape[0] // 2
+    lower = np.int64(128)
+    upper = np.int64(128)
+    for i in range(count):
+        upper += np.int64(content[i]) - 128
+    start = 0
+    for y in range(lines):
+        for channel in range(channels):
+            place = -1
+            for c in range(3):
+                if order[c] == channel:
+                    place = c
+            for x in range(width):
+                lower += np.int64(content[start + x]) - 128
+                upper += np.int64(content[count + start + x]) - 128
+                if place >= 0:
+                    out[y, x, place] = (lower & 255) | ((upper & 255) << 8)
+            start += width
+
+
+@kernel
+def finite_range(bits: Bits, sign: int, infinite: int) -> tuple[int, int, int]:
+    """Smallest and largest finite value of floats, and the number of positive ones.
+
+    Values are signed integers with the bits of the floats. They are compared, and
+    returned, with the bits of negative ones inverted except for the sign, which gives
+    them the order of the floats. The smallest is larger than the largest if no value is
+    finite.
+
+    Parameters
+    ----------
+    bits
+        (n,) the values.
+    sign
+        All bits except for that of the sign.
+    infinite
+        Bits of infinity.
+    """
+    low = np.int32(infinite)
+    high = np.int32(-infinite - 1)
+    positive = np.int32(0)
+    for i in range(bits.shape[0]):
+        value = np.int32(bits[i])
+        ordered = np.int32(value ^ ((value >> 31) & np.int32(sign)))
+        finite = (value & np.int32(infinite)) != np.int32(infinite)
+        low = min(low, ordered if finite else np.int32(infinite))
+        high = max(high, ordered if finite else np.int32(-infinite - 1))
+        positive += np.int32(finite and ordered > 0)
+    return int(low), int(high), int(positive)
