@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +24,7 @@ from skindb.render.monte_carlo import (
     Lighting,
     Quality,
     render_monte_carlo,
+    stratified,
 )
 from skindb.render.scene import Camera, Environment, Lights, Surface
 from skindb.render.shading import (
@@ -387,3 +390,38 @@ def test_light_choice__few_lights_are_all_used() -> None:
 def test_light_choice__lights_that_are_off_give_a_black_picture() -> None:
     dark = replace(around(), intensity=np.zeros((COUNT, 3)))
     assert rendered(ball(), Lighting(dark), samples=16).radiance.max() == 0
+
+
+def test_stratified__one_ray_in_every_cell_row_and_column() -> None:
+    side = 4
+    count = side**2
+    pixel = np.repeat([7, 3, 11], count)
+    view: Any = SimpleNamespace(
+        samples=side, pixel=pixel, ray=np.tile(np.arange(count), 3)
+    )
+    drawn = stratified(view, np.random.default_rng(0))
+    whole = np.tile(np.arange(count), 3)
+    for k in range(2):
+        np.testing.assert_array_equal(
+            np.sort((drawn[:, k] * count).astype(int).reshape(3, count)).ravel(), whole
+        )
+    column, row = (drawn * side).astype(int).T
+    cell = (column * side + row).reshape(3, count)
+    np.testing.assert_array_equal(np.sort(cell).ravel(), whole)
+    # pixels do not share their numbers
+    assert len(np.unique(np.round(drawn[:, 0], 9))) == 3 * count
+
+
+def test_environment__shares_out_stratified_draws_between_a_sun_and_the_sky() -> None:
+    """Of 16 rays, those towards a sun of four texels differ by less than one from pixel
+    to pixel; in the order of the rows they would differ by more.
+    """
+    image = np.ones((32, 64, 3))
+    for row, column in ((4, 5), (9, 40), (16, 20), (20, 60)):
+        image[row, column] = 500
+    sky = Environment(image)
+    rng = np.random.default_rng(1)
+    first = (np.arange(16) + rng.random((1000, 16))) / 16
+    draw = np.stack([first.ravel(), rng.random(16_000)], axis=1)
+    bright = sky.along(sky.sample(draw))[:, 0] > 1
+    assert np.ptp(bright.reshape(1000, 16).sum(axis=1)) <= 1
