@@ -21,13 +21,13 @@ from skindb.schema.cohort import (
     take_coords,
 )
 from skindb.schema.notes import Note, note, note_lines
+from skindb.store.arrays import open_group
 from skindb.store.bucket import place_at
 from skindb.store.log import RESTORE
 from skindb.store.place import SUMMARY, Located, Place
 from skindb.store.record import AS_RECORDED, Record
 from skindb.store.snapshot import Lookup, Snapshot
 from skindb.store.stage import describe, read_tables
-from skindb.store.verified import open_group
 
 Layout = Literal["tables", "surfels", "maps"]
 GROUP: dict[str, str] = {"tables": "tables", "surfels": "sample", "maps": "maps"}

@@ -14,6 +14,7 @@ import xarray as xr
 from skindb.errors import Fault, InputError, input_error, require
 from skindb.schema.consent import CONSENT
 from skindb.store.archive import Archive
+from skindb.store.arrays import open_version
 from skindb.store.audit import AuditEntry, append_entry, read_audit
 from skindb.store.backup import BackupReport, create_backup, erase_from_archive
 from skindb.store.bucket import place_at
@@ -61,7 +62,6 @@ from skindb.store.snapshot import (
 )
 from skindb.store.stage import Stage, read_tables, remove_version
 from skindb.store.stale import Request, read_requests, remove_request
-from skindb.store.verified import open_version
 from skindb.store.verify import database_faults
 
 

@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 import xarray as xr
 import zarr
-from zarr.codecs import BloscCodec, TransposeCodec
+from zarr.codecs import BloscCodec
 from zarr.core.buffer import default_buffer_prototype
 from zarr.core.sync import sync
 
@@ -181,13 +181,8 @@ class Stage:
             self._nodes |= {name, *(f"{name}/{variable}" for variable in ds.variables)}
             ready = _whole_shards(ds).assign_attrs(plain(ds.attrs))
             encoding = {str(v): _encoding(ready[v]) for v in ready.variables}
-            # write_empty_chunks: the search for empty chunks would take as long as
-            # their compression; order: samples are produced and stored in column-major
-            # order, and the other order costs two transpositions
-            order = "F" if any("filters" in how for how in encoding.values()) else "C"
-            with zarr.config.set(
-                {"array.write_empty_chunks": True, "array.order": order}
-            ):
+            # the search for empty chunks would take as long as their compression
+            with zarr.config.set({"array.write_empty_chunks": True}):
                 store = self.place.writable(self.path)
                 with add_filename(self.place.where(self.path)):
                     ready.to_zarr(
@@ -519,8 +514,4 @@ def _encoding(array: xr.DataArray) -> dict[str, Any]:
     # a shard is allocated in full, so that of a small take is no larger than the array
     chunk = min(chunk, length)
     shard = min(rows, -(-length // chunk) * chunk)
-    plain |= {"chunks": (chunk, *rest), "shards": (shard, *rest)}
-    # samples compress best with neighbouring surfels next to each other
-    if array.ndim == 4:
-        plain["filters"] = [TransposeCodec(order=(3, 2, 1, 0))]
-    return plain
+    return plain | {"chunks": (chunk, *rest), "shards": (shard, *rest)}

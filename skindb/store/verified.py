@@ -11,7 +11,6 @@ from collections.abc import AsyncIterator, Iterable
 from functools import cached_property
 from typing import Any, NamedTuple
 
-import xarray as xr
 from zarr.abc.store import (
     ByteRequest,
     OffsetByteRequest,
@@ -22,7 +21,6 @@ from zarr.abc.store import (
 from zarr.core.buffer import Buffer, BufferPrototype
 
 from skindb.errors import Fault, InputError, input_error
-from skindb.schema.label import BLOCK_SURFELS
 from skindb.store.place import BLOCK_BYTES, Digests, Place, block_digests
 from skindb.store.record import Record, json_object
 
@@ -272,35 +270,6 @@ class VerifiedStore(ListedStore):
                 CURE,
             )
         )
-
-
-def open_version(place: Place, record: Record) -> xr.DataTree:
-    """A version as a lazy DataTree, in blocks of 4,096 surfels where it has samples, and
-    of whole objects elsewhere.
-    """
-    store = VerifiedStore(place, record)
-    # chunks={} would use the inner chunks, which gives sixteen times as many tasks
-    tree = xr.open_datatree(store, engine="zarr", consolidated=False, chunks=None)  # type: ignore[arg-type]
-    blocked = tree.map_over_datasets(_chunked)
-    blocked.attrs = {**tree.attrs, "generation": record.generation}
-    return blocked
-
-
-def open_group(place: Place, record: Record, group: str) -> xr.Dataset:
-    """One group of a version, without opening the others."""
-    store: Any = VerifiedStore(place, record)
-    options: dict[str, Any] = {"engine": "zarr", "consolidated": False, "chunks": None}
-    return _chunked(xr.open_dataset(store, group=group, **options))
-
-
-def _chunked(ds: xr.Dataset) -> xr.Dataset:
-    if "surfel" not in ds.dims:
-        return ds
-    shards = [variable.encoding.get("shards") for variable in ds.variables.values()]
-    rows = min((shard[0] for shard in shards if shard), default=BLOCK_SURFELS)
-    if any(variable.ndim > 3 for variable in ds.data_vars.values()):
-        rows = BLOCK_SURFELS  # samples, from which long computations are made
-    return ds.chunk(surfel=rows)
 
 
 def limits(byte_range: Any) -> tuple[int, int | None]:

@@ -9,16 +9,14 @@ import random
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-import zarr
 from traces import contents
 
 from skindb.schema import dataset
-from skindb.store import Database, Record, stage
+from skindb.store import Database, Record
 
 DATABASES = 500
 # pseudonyms, and at the same time words of messages, sites, regions, attributes,
@@ -218,38 +216,7 @@ def _files_of(root: Path, record: Record) -> dict[str, bytes]:
     }
 
 
-class _QuickGroup:
-    """A root group without arrays, whose attributes are written directly: zarr takes
-    ten times as long.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.attrs = self
-
-    def update(self, attrs: dict[str, Any]) -> None:
-        self.folder.mkdir(parents=True)
-        text = json.dumps({"zarr_format": 3, "node_type": "group", "attributes": attrs})
-        (self.folder / "zarr.json").write_text(text)
-
-
-@pytest.fixture
-def _quick_commits(monkeypatch):
-    def open_group(store, **options):
-        is_new = not Path(store.root).exists()
-        return (
-            _QuickGroup(Path(store.root))
-            if is_new
-            else zarr.open_group(store, **options)
-        )
-
-    monkeypatch.setattr(
-        stage, "zarr", SimpleNamespace(open_group=open_group, config=zarr.config)
-    )
-
-
 @pytest.mark.slow
-@pytest.mark.usefixtures("_quick_commits")
 def test_erase__removes_what_refers_to_the_subject_and_nothing_else(tmp_path):
     removed = kept = 0
     for seed in range(DATABASES):

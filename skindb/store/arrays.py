@@ -1,0 +1,171 @@
+"""Arrays of a version that are decoded straight into the result.
+
+zarr copies every chunk several times on its way into an array. The arrays that skindb
+writes have one plain chain of codecs (bytes and Blosc, in shards along the first
+dimension), so that each chunk is decompressed where its values belong. All other arrays,
+and all other programs, read them by zarr.
+"""
+
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numcodecs import blosc
+from numpy.typing import NDArray
+from xarray.backends import BackendArray
+from xarray.core import indexing
+from zarr.codecs import BloscCodec, BytesCodec
+
+from skindb.schema.label import BLOCK_SURFELS
+from skindb.store.place import Place
+from skindb.store.record import Record
+from skindb.store.verified import VerifiedStore
+
+INDEX_BYTES = 16  # of a chunk in the index of a shard: offset and length
+CHECKSUM_BYTES = 4  # after the index; the digests of the file cover it too
+
+
+@dataclass(frozen=True)
+class ShardedArray(BackendArray):
+    """An array (n, ...) of a version as xarray's source of lazy values."""
+
+    store: VerifiedStore
+    name: str
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    chunk: int  # elements along the first dim in a chunk
+    shard: int  # and in an object
+
+    def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
+        return indexing.explicit_indexing_adapter(
+            key, self.shape, indexing.IndexingSupport.OUTER, self._selected
+        )
+
+    def _selected(self, key: tuple[Any, ...]) -> NDArray[Any]:
+        """Values at one slice, index or list of indices along each dim."""
+        first, *others = key
+        if isinstance(first, slice) and first.step in (None, 1):
+            begin, end, _ = first.indices(self.shape[0])
+            values = self.rows(begin, max(begin, end))
+        else:
+            values = self._listed(np.atleast_1d(np.arange(self.shape[0])[first]))
+        for dim, index in reversed([*enumerate(others, 1)]):
+            values = values[(slice(None),) * dim + (index,)]
+        return values[0] if isinstance(first, int | np.integer) else values
+
+    def _listed(self, index: NDArray[np.intp]) -> NDArray[Any]:
+        """Values at these indices along the first dim; each chunk is read once."""
+        out = np.empty((len(index), *self.shape[1:]), self.dtype)
+        numbers = index // self.chunk
+        for number in np.unique(numbers).tolist():
+            begin = number * self.chunk
+            values = self.rows(begin, min(begin + self.chunk, self.shape[0]))
+            here = numbers == number
+            out[here] = values[index[here] - begin]
+        return out
+
+    def rows(self, begin: int, end: int) -> NDArray[Any]:
+        """Values from `begin` to `end` along the first dim."""
+        out = np.empty((end - begin, *self.shape[1:]), self.dtype)
+        while begin < end:
+            number = begin // self.shard
+            stop = min(end, (number + 1) * self.shard)
+            self._decode(number, begin, stop, out[len(out) - (end - begin) :])
+            begin = stop
+        return out
+
+    def _decode(self, number: int, begin: int, end: int, out: NDArray[Any]) -> None:
+        """Write the values from `begin` to `end`, which are in one object, to `out`."""
+        key = f"{self.name}/c/{number}{'/0' * (len(self.shape) - 1)}"
+        origin = number * self.shard
+        first = (begin - origin) // self.chunk
+        last = -(-(end - origin) // self.chunk)
+        index_bytes = INDEX_BYTES * (self.shard // self.chunk) + CHECKSUM_BYTES
+        start = 0
+        if first == 0 and end == min(origin + self.shard, self.shape[0]):
+            content = memoryview(self.store.read(key))
+            index = content[-index_bytes:]
+        else:
+            content = memoryview(b"")
+            index = memoryview(self.store.read(key, -index_bytes))
+        table = np.frombuffer(index[:-CHECKSUM_BYTES], "<u8").reshape(-1, 2)
+        table = table[first:last].astype(np.int64)
+        if not content:
+            start = int(table[:, 0].min())
+            content = memoryview(self.store.read(key, start, int(table.sum(1).max())))
+        row = self.dtype.itemsize * int(np.prod(self.shape[1:]))
+        target = out.reshape(-1).view(np.uint8)
+        for place, (offset, length) in enumerate(table.tolist(), first):
+            low = origin + place * self.chunk
+            source = content[offset - start : offset - start + length]
+            a = max(low, begin)
+            b = min(low + self.chunk, end)
+            values = target[(a - begin) * row : (b - begin) * row]
+            if b - a == self.chunk:
+                blosc.decompress(source, values)
+            else:  # the first or last chunk
+                chunk = np.frombuffer(blosc.decompress(source), np.uint8)
+                values[:] = chunk[(a - low) * row : (b - low) * row]
+
+
+def open_version(place: Place, record: Record) -> xr.DataTree:
+    """A version as a lazy DataTree, in blocks of 4,096 surfels where it has samples, and
+    of whole objects elsewhere.
+    """
+    store = VerifiedStore(place, record)
+    # chunks={} would use the inner chunks, which gives sixteen times as many tasks
+    tree = xr.open_datatree(store, engine="zarr", consolidated=False, chunks=None)  # type: ignore[arg-type]
+    groups = {
+        path: _lazy(store, path.strip("/"), node.to_dataset(inherit=False))
+        for path, node in tree.subtree_with_keys
+    }
+    lazy = xr.DataTree.from_dict(groups)
+    lazy.attrs = {**tree.attrs, "generation": record.generation}
+    return lazy
+
+
+def open_group(place: Place, record: Record, group: str) -> xr.Dataset:
+    """One group of a version, without opening the others."""
+    store: Any = VerifiedStore(place, record)
+    options: dict[str, Any] = {"engine": "zarr", "consolidated": False, "chunks": None}
+    return _lazy(store, group, xr.open_dataset(store, group=group, **options))
+
+
+def _lazy(store: VerifiedStore, group: str, ds: xr.Dataset) -> xr.Dataset:
+    """A group that xarray has opened, in blocks of surfels; arrays with the codecs of
+    skindb are decoded straight into the result.
+    """
+    if "surfel" not in ds.dims:
+        return ds
+    arrays: dict[Hashable, ShardedArray] = {}
+    for name, variable in ds.data_vars.items():
+        how = variable.encoding
+        if _is_direct(how):
+            extent = (how["chunks"][0], how["shards"][0])
+            path = f"{group}/{name}"
+            shape = variable.shape
+            arrays[name] = ShardedArray(store, path, shape, variable.dtype, *extent)
+    rows = min((array.shard for array in arrays.values()), default=BLOCK_SURFELS)
+    if any(array.ndim > 3 for array in arrays.values()):
+        rows = BLOCK_SURFELS  # samples, from which long computations are made
+    direct = {
+        name: (ds[name].dims, indexing.LazilyIndexedArray(array), ds[name].attrs)
+        for name, array in arrays.items()
+    }
+    return ds.assign(direct).chunk(surfel=rows)
+
+
+def _is_direct(how: Mapping[Any, Any]) -> bool:
+    """Whether an array has the codecs of skindb, and is divided along the first dim only."""
+    chunks: Any = how.get("chunks")
+    shards: Any = how.get("shards")
+    return (
+        bool(chunks and shards)
+        and chunks[1:] == shards[1:]
+        and not how["filters"]
+        and [type(codec) for codec in how["compressors"]] == [BloscCodec]
+        and how["serializer"] in (BytesCodec(endian="little"), BytesCodec(endian=None))
+        and np.dtype(how["dtype"]).isnative
+    )
