@@ -63,7 +63,16 @@ def read_manifest(place: Place, record: Record) -> Manifest:
     """Every file of a version as it was committed; `InputError` if the manifest is not
     the committed one.
     """
-    return manifest_from_json(read_beside(place, record, "manifest", record.manifest))
+    content = read_beside(place, record, "manifest", record.manifest)
+    try:
+        return manifest_from_json(content)
+    except (TypeError, ValueError):
+        raise input_error(
+            place.where(record.beside("manifest")),
+            "a manifest must list the size and the digests of every file",
+            "that of another release of skindb",
+            "compute the version again: skindb ingest, then skindb fit --refit",
+        ) from None
 
 
 def manifest_from_json(content: bytes) -> Manifest:

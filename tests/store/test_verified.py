@@ -228,6 +228,14 @@ def test_read__reports_a_damaged_manifest(db, change):
     assert "manifest.json" in str(db.verify()[0])
 
 
+def test_read__says_that_a_manifest_has_another_layout(db, monkeypatch):
+    """As in a database of an earlier commit: its digest is right."""
+    content = b'{"zarr.json": ["0f", 5]}'
+    monkeypatch.setattr("skindb.store.verified.read_beside", lambda *_: content)
+    with pytest.raises(InputError, match=r"another release.*compute the version again"):
+        db.read("capture", "A1")
+
+
 def test_verified_store__is_small_in_another_process(db):
     store = VerifiedStore(db.place, db.record("capture", "A1"))
     # dask copies stores for names
