@@ -13,9 +13,8 @@ import math
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
-import numba as nb
 import numpy as np
 from llvmlite import ir
 from numba import types
@@ -23,7 +22,7 @@ from numba.core import cgutils, event
 from numba.extending import intrinsic, overload
 from numpy.typing import NDArray
 
-from skindb.kernel_cache import KernelFiles
+from skindb.kernel_compiler import Kernel
 from skindb.types import Integer, IntVector32, Matrix32, Real, Vector32
 
 # a kernel keeps its signature for mypy, which checks its callers
@@ -31,16 +30,16 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 # sums may be reordered and products fused; NaN and inf keep their meaning
 # (`fastmath=True` would drop tests for them)
 FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
-# cached on disk; without the GIL; a division by zero gives inf, because tests for it
-# would prevent vectorised loops
-OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
+# without the GIL; a division by zero gives inf, because tests for it would prevent
+# vectorised loops
+OPTIONS: dict[str, Any] = {"nopython": True, "nogil": True, "error_model": "numpy"}
 # 0: only code that Numba compiles itself, see the vector steps below
 INTRINSICS = os.environ.get("SKINDB_INTRINSICS", "1") != "0"
 
 
 def kernel(function: Function) -> Function:
     """Compile a kernel whose sums keep their order."""
-    return _stored(nb.njit(**OPTIONS)(function))
+    return cast(Function, Kernel(function, OPTIONS))
 
 
 def fast_kernel(function: Function) -> Function:
@@ -50,23 +49,21 @@ def fast_kernel(function: Function) -> Function:
     compiled both would call the separately compiled copy, and a process that reads them
     from the disk the copy next to the caller, which may sum in another order.
     """
-    return _stored(nb.njit(fastmath=FAST, forceinline=True, **OPTIONS)(function))
+    return cast(
+        Function, Kernel(function, OPTIONS | {"fastmath": FAST, "forceinline": True})
+    )
 
 
 def inline_kernel(function: Function) -> Function:
     """Like `kernel`, but inlined by Numba into each of its callers."""
-    return _stored(nb.njit(inline="always", **OPTIONS)(function))
+    return cast(Function, Kernel(function, OPTIONS | {"inline": "always"}))
 
 
 def inline_fast_kernel(function: Function) -> Function:
     """Like `fast_kernel`, but inlined by Numba into each of its callers."""
-    return _stored(nb.njit(fastmath=FAST, inline="always", **OPTIONS)(function))
-
-
-def _stored(compiled: Any) -> Any:
-    """Keep the compiled code on disk as long as nothing that it contains changes."""
-    compiled._cache._cache_file = KernelFiles(compiled)
-    return compiled
+    return cast(
+        Function, Kernel(function, OPTIONS | {"fastmath": FAST, "inline": "always"})
+    )
 
 
 @contextmanager

@@ -38,7 +38,9 @@ class KernelFiles(IndexDataCacheFile):  # type: ignore[misc]
     def __init__(self, compiled: Any) -> None:
         self._cache_path = compiled._cache.cache_path
         self.compiled = compiled
-        self.name = compiled.py_func.__module__ + "." + compiled.py_func.__qualname__
+        function = compiled.py_func
+        kind = "linked." if compiled.targetoptions.get("no_cpython_wrapper") else ""
+        self.name = f"{kind}{function.__module__}.{function.__qualname__}"
 
     def load(self, key: tuple[Any, ...]) -> Any:
         """The compiled signature, None if there is none."""
@@ -62,7 +64,7 @@ class KernelFiles(IndexDataCacheFile):  # type: ignore[misc]
 
 
 def digest(compiled: Any) -> str:
-    """Digest of the versions of Python and Numba, of a kernel, of all functions that it
+    """Digest of Python, Numba and our compiler, of a kernel, of all functions that it
     calls and of all constants that these use; independent of comments and lines.
     """
     waiting = [compiled]
@@ -72,7 +74,8 @@ def digest(compiled: Any) -> str:
         if value not in parts:
             parts[value], used = _function_parts(value)
             waiting += used
-    versions = f"{sys.implementation.cache_tag} {nb.__version__}"
+    compiler = Path(__file__).with_name("kernel_compiler.py").read_text()
+    versions = f"{sys.implementation.cache_tag} {nb.__version__} {compiler}"
     return _digest([versions, parts[compiled], *sorted(parts.values())])
 
 
