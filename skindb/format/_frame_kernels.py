@@ -1,4 +1,4 @@
-"""Kernels of frames: from the inflated bytes of OpenEXR to values, and their range."""
+"""Kernels of frames: from the inflated bytes of OpenEXR and PNG to values; their range."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.jit import kernel
-from skindb.types import ByteVector, IntVector
+from skindb.types import ByteMatrix, ByteVector, IntVector
 
 Halves = np.ndarray[tuple[int, int, int], np.dtype[np.uint16]]  # bits of half floats
 Bits = NDArray[np.signedinteger]  # int16 or int32, the bits of half or single floats
@@ -49,6 +49,65 @@ def unpack_lines(content: ByteVector, order: IntVector, out: Halves) -> None:
                 if place >= 0:
                     out[y, x, place] = (lower & 255) | ((upper & 255) << 8)
             start += width
+
+
+@kernel
+def undo_filters(content: ByteMatrix, step: int, swap: int, out: ByteMatrix) -> bool:
+    """Undo the filters of PNG (ISO/IEC 15948, section 9); False if one is unknown.
+
+    Parameters
+    ----------
+    content
+        (h, 1 + n) inflated bytes: the filter of each row, and its bytes.
+    step
+        Number of bytes of a pixel.
+    swap
+        1 if the bytes of a value are exchanged, 0 otherwise.
+    out
+        (h, n) output.
+    """
+    height, size = out.shape
+    zeros = np.zeros(size, np.uint8)
+    for y in range(height):
+        kind = content[y, 0]
+        row = content[y, 1:]
+        line = out[y]
+        above = out[y - 1] if y else zeros
+        if kind == 0:
+            for i in range(size):
+                line[i ^ swap] = row[i]
+        elif kind == 1:
+            for i in range(step):
+                line[i ^ swap] = row[i]
+            for i in range(step, size):
+                line[i ^ swap] = row[i] + line[(i - step) ^ swap]
+        elif kind == 2:
+            for i in range(size):
+                line[i ^ swap] = row[i] + above[i ^ swap]
+        elif kind == 3:
+            for i in range(size):
+                left = np.int64(line[(i - step) ^ swap]) if i >= step else np.int64(0)
+                mean = (left + np.int64(above[i ^ swap])) // 2
+                line[i ^ swap] = np.int64(row[i]) + mean
+        elif kind == 4:
+            for i in range(size):
+                up = np.int64(above[i ^ swap])
+                left = np.int64(line[(i - step) ^ swap]) if i >= step else np.int64(0)
+                corner = (
+                    np.int64(above[(i - step) ^ swap]) if i >= step else np.int64(0)
+                )
+                from_left = abs(up - corner)
+                from_up = abs(left - corner)
+                from_corner = abs(left + up - 2 * corner)
+                nearest = corner
+                if from_left <= from_up and from_left <= from_corner:
+                    nearest = left
+                elif from_up <= from_corner:
+                    nearest = up
+                line[i ^ swap] = np.int64(row[i]) + nearest
+        else:
+            return False
+    return True
 
 
 @kernel

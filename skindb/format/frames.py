@@ -11,6 +11,7 @@ import operator
 import os
 import stat
 import struct
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -29,7 +30,7 @@ from numpy.typing import NDArray
 from skindb.elementwise import thread_count
 from skindb.errors import Fault, InputError, attempt, input_error, require
 from skindb.files import open_regular, private_file, read_regular
-from skindb.format._frame_kernels import unpack_lines
+from skindb.format._frame_kernels import undo_filters, unpack_lines
 from skindb.format.fields import IDENTIFIER, Fields, short
 from skindb.limits import (
     MAX_EXPOSURES,
@@ -48,6 +49,7 @@ Digests = dict[Path, str]  # sha256 of the bytes that were decoded
 PNG_HEAD = b"\x89PNG\r\n\x1a\n"
 PNG_TAIL = b"IEND\xaeB`\x82"
 PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # colour type of IHDR
+PNG_CRITICAL = {b"IHDR", b"IDAT", b"IEND"}
 # lines per chunk, by compression
 EXR_LINES = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}
 EXR_ZIPPED = (2, 3)  # compressions ZIPS and ZIP
@@ -408,6 +410,46 @@ def _half_channels(content: bytes) -> list[str]:
 
 
 def _decode_png(_: Path, content: bytes) -> Frame:
+    width, height, bits, colour, *kinds = struct.unpack_from(">IIBBBBB", content, 16)
+    chunks = _png_chunks(content)
+    names = {name for name, _ in chunks}
+    # critical chunks begin with a capital
+    plain = not any(name[:1].isupper() for name in names - PNG_CRITICAL)
+    if bits < 8 or colour != 2 or any(kinds) or not plain or b"tRNS" in names:
+        return _decode_any_png(content)
+    dtype = np.dtype("uint16" if bits == 16 else "uint8")
+    step = 3 * dtype.itemsize
+    rows = np.empty((height, 1 + width * step), np.uint8)
+    packed = b"".join(data for name, data in chunks if name == b"IDAT")
+    try:
+        size = len(imagecodecs.deflate_decode(packed, out=rows.reshape(-1).data))
+    except RuntimeError:
+        size = 0
+    out = np.empty((height, width, 3), dtype)
+    swap = int(bits == 16 and sys.byteorder == "little")
+    values = out.view(np.uint8).reshape(height, -1)
+    if size != rows.size or not undo_filters(rows, step, swap, values):
+        raise UnreadableError(DAMAGED)
+    return out
+
+
+def _png_chunks(content: bytes) -> list[tuple[bytes, bytes]]:
+    """Names and data of the chunks up to the end of the picture."""
+    chunks = []
+    offset = len(PNG_HEAD)
+    name = b""
+    while name != b"IEND":
+        length, name = struct.unpack_from(">I4s", content, offset)
+        end = offset + 8 + length
+        digest = imagecodecs.deflate_crc32(content[offset + 4 : end])
+        if content[end : end + 4] != digest.to_bytes(4, "big"):
+            raise UnreadableError(DAMAGED)
+        chunks.append((name, content[offset + 8 : end]))
+        offset = end + 4
+    return chunks
+
+
+def _decode_any_png(content: bytes) -> Frame:
     try:
         return imagecodecs.png_decode(content)
     except (ValueError, RuntimeError):  # the decoder raises RuntimeError

@@ -4,6 +4,7 @@ import contextlib
 import io
 import tracemalloc
 
+import imagecodecs
 import numpy as np
 import OpenEXR
 import pytest
@@ -58,6 +59,30 @@ CHANNELS = {
         "B": HALF[..., 2].copy(),
     },
 }
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_read_frame__png_of_every_filter(tmp_path, dtype):
+    ramp = np.add.outer(np.arange(23), np.arange(31))[..., None] * [3, 50, 700]
+    noise = RNG.integers(0, np.iinfo(dtype).max + 1, ramp.shape)
+    for kind in imagecodecs.PNG.FILTER:
+        for frame in (ramp, noise, 0 * ramp):
+            content = imagecodecs.png_encode(frame.astype(dtype), filter=kind)
+            (tmp_path / "a.png").write_bytes(content)
+            found = read_frame(tmp_path / "a.png")
+            assert found.dtype == dtype
+            np.testing.assert_array_equal(found, frame.astype(dtype))
+
+
+def test_read_frame__every_changed_byte_of_a_png_is_damage_or_no_pixel(tmp_path):
+    frame, _ = FRAMES["a16.png"]
+    content = imagecodecs.png_encode(frame)
+    for place in range(8, len(content)):
+        changed = bytearray(content)
+        changed[place] ^= 4
+        (tmp_path / "a.png").write_bytes(changed)
+        with pytest.raises(InputError):
+            read_frame(tmp_path / "a.png")
 
 
 @pytest.mark.parametrize("compression", ["NO", "RLE", "ZIPS", "ZIP", "PIZ", "DWAA"])
