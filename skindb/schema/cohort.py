@@ -1,5 +1,6 @@
 """Combining Datasets of many takes into one labelled, lazy Dataset."""
 
+import math
 import re
 import unicodedata
 import uuid
@@ -7,6 +8,7 @@ from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import dask.array as da
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
@@ -17,6 +19,9 @@ from skindb.schema.notes import note
 from skindb.schema.variables import VARIABLES
 
 TAKE = "take"
+# of a variable of a cohort in one task; maps and samples of takes are larger
+MAX_BLOCK_TAKES = 256
+MAX_BLOCK_BYTES = 1 << 22
 COMPARED = (
     "k",
     "mode",
@@ -329,73 +334,93 @@ def _all_labels(
     return {dim: list(values) for dim, values in labels.items()}
 
 
+@dataclass(frozen=True)
+class Stack:
+    """A variable of many takes as an array, of which only the selected takes are read."""
+
+    variable: str
+    sources: tuple[Source | None, ...]  # of each take; None if it lacks the variable
+    size: tuple[int, ...]  # of the values of one take
+    places: Mapping[str, Mapping[Any, int]]  # dim -> index of each label
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of takes, and size of the values of one."""
+        return (len(self.sources), *self.size)
+
+    @property
+    def ndim(self) -> int:
+        """Number of dims."""
+        return len(self.shape)
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the values."""
+        return _absent(self.variable, ()).dtype
+
+    def __getitem__(self, key: tuple[Any, ...]) -> NDArray[Any]:
+        first, *others = key
+        takes = np.arange(len(self.sources))[first]
+        blank = selected(_absent(self.variable, self.size), others)
+        out = np.empty((takes.size, *np.shape(blank)), self.dtype)
+        out[:] = blank
+        for i, take in enumerate(takes.flat):
+            source = self.sources[take]
+            if source is not None:
+                values = self._in_layout(source.read(self.variable))
+                out[i] = selected(values, others)
+        return out if takes.ndim else out[0]
+
+    def _in_layout(self, values: xr.DataArray) -> NDArray[Any]:
+        """Values of one take in the layout of the cohort."""
+        out = _absent(self.variable, self.size)
+        indices: list[Any] = []
+        for dim, size in zip(values.dims, self.size, strict=True):
+            if dim in self.places and dim in values.coords:
+                place = self.places[str(dim)]
+                indices.append([place[label] for label in values[dim].values.tolist()])
+            else:
+                indices.append(range(min(values.sizes[dim], size)))
+        inside = values.values[tuple(slice(len(index)) for index in indices)]
+        out[np.ix_(*indices)] = inside
+        return out
+
+
+def selected(values: NDArray[Any], key: Sequence[Any]) -> NDArray[Any]:
+    """Values at a slice, index or list of indices along each of the first dims."""
+    for dim, index in reversed([*enumerate(key)]):
+        values = values[(slice(None),) * dim + (index,)]
+    return values
+
+
 def _lazy(
     name: str,
     parts: Sequence[Part],
     extent: Mapping[str, int],
     labels: Mapping[str, Sequence[Any]],
 ) -> xr.Variable:
-    """A variable of every take, a block for each, whose task carries its own source alone."""
-    # a third of the start-up of `skindb info`, which forms no arrays
-    import dask.array as da
-
-    spec = VARIABLES[name]
-    shape = tuple(extent[dim] for dim in spec.dims)
-    absent = _absent(name, ())
-    places = {
-        dim: {value: i for i, value in enumerate(labels[dim])}
-        for dim in spec.dims
-        if dim in labels
-    }
-    data = da.map_blocks(  # type: ignore[no-untyped-call]
-        _block,
-        _one_each([part.source if name in part.variables else None for part in parts]),
-        dtype=absent.dtype,
-        chunks=((1,) * len(parts), *((size,) for size in shape)),
-        new_axis=list(range(1, 1 + len(shape))),
-        meta=np.empty((0,) * (1 + len(shape)), absent.dtype),
-        variable=name,
-        shape=shape,
-        places=places,
+    """A variable of every take, in blocks of few bytes; selected takes are read alone."""
+    dims = VARIABLES[name].dims
+    stack = Stack(
+        name,
+        tuple(part.source if name in part.variables else None for part in parts),
+        tuple(extent[dim] for dim in dims),
+        {
+            dim: {value: i for i, value in enumerate(labels[dim])}
+            for dim in dims
+            if dim in labels
+        },
     )
-    plain = label(name, np.zeros((0,) * len(spec.dims)))
-    return xr.Variable((TAKE, *spec.dims), data, plain.attrs)
-
-
-def _one_each(sources: Sequence[Source | None]) -> Any:
-    """A Dask array of objects in blocks of one."""
-    import dask.array as da
-
-    name = f"sources-{uuid.uuid4().hex}"
-    blocks = {}
-    for i, source in enumerate(sources):
-        blocks[name, i] = np.empty(1, object)
-        blocks[name, i][0] = source
-    return da.Array(blocks, name, chunks=((1,) * len(sources),), dtype=object)  # type: ignore[no-untyped-call]
-
-
-def _block(
-    source: NDArray[Any],
-    *,
-    variable: str,
-    shape: tuple[int, ...],
-    places: Mapping[str, Mapping[Any, int]],
-) -> NDArray[Any]:
-    """Values (1, ...) of one take in the layout of the cohort."""
-    out = _absent(variable, shape)
-    if source[0] is not None:
-        values = source[0].read(variable)
-        indices: list[Any] = []
-        for dim, size in zip(values.dims, shape, strict=True):
-            if dim in places and dim in values.coords:
-                indices.append(
-                    [places[str(dim)][value] for value in values[dim].values.tolist()]
-                )
-            else:
-                indices.append(range(min(values.sizes[dim], size)))
-        inside = values.values[tuple(slice(len(index)) for index in indices)]
-        out[np.ix_(*indices)] = inside
-    return out[None]
+    take_bytes = max(stack.dtype.itemsize * math.prod(stack.size), 1)
+    takes = min(max(MAX_BLOCK_BYTES // take_bytes, 1), MAX_BLOCK_TAKES)
+    data = da.from_array(  # type: ignore[no-untyped-call]
+        stack,
+        chunks=(takes, *stack.size),
+        name=f"cohort-{uuid.uuid4().hex}",
+        meta=np.empty((0,) * stack.ndim, stack.dtype),
+    )
+    plain = label(name, np.zeros((0,) * len(dims)))
+    return xr.Variable((TAKE, *dims), data, plain.attrs)
 
 
 def _absent(name: str, shape: tuple[int, ...]) -> NDArray[Any]:

@@ -18,6 +18,7 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 from zarr.codecs import BloscCodec, BytesCodec
 
+from skindb.schema.cohort import selected
 from skindb.schema.label import BLOCK_SURFELS
 from skindb.store.place import Place
 from skindb.store.record import Record
@@ -51,8 +52,7 @@ class ShardedArray(BackendArray):
             values = self.rows(begin, max(begin, end))
         else:
             values = self._listed(np.atleast_1d(np.arange(self.shape[0])[first]))
-        for dim, index in reversed([*enumerate(others, 1)]):
-            values = values[(slice(None),) * dim + (index,)]
+        values = selected(values, (slice(None), *others))
         return values[0] if isinstance(first, int | np.integer) else values
 
     def _listed(self, index: NDArray[np.intp]) -> NDArray[Any]:

@@ -53,6 +53,8 @@ from skindb.store.markers import (
 from skindb.store.place import subject_of
 from skindb.store.record import Record
 from skindb.store.snapshot import (
+    CACHED_KINDS,
+    READER_THREADS,
     Lookup,
     RecordCache,
     Snapshot,
@@ -379,14 +381,22 @@ class Database:
         >>> cohort = db.cohort("tables")  # doctest: +SKIP
         >>> cohort.region_diffuse_reflectance.groupby("gender").mean()  # doctest: +SKIP
         """
-        return cohort(
-            Lookup(self, release),
+        # registrations are not cached, because each names every take; few takes are
+        # read faster without the records of all others
+        is_cached = kind == "model" and layout != "maps"
+        is_cached &= takes is None or len(takes) > READER_THREADS
+        lookup = Lookup(self, release, RecordCache(self.place) if is_cached else None)
+        lookup.read_ahead(CACHED_KINDS)
+        combined = cohort(
+            lookup,
             CohortRequest(layout, surfels, size, seed),
             kind=kind,
             variables=variables,
             takes=takes,
             dim=dim,
         )
+        lookup.save()
+        return combined
 
     def table(self, *, release: str | None = None) -> pd.DataFrame:
         """The catalogue, with one row per take.

@@ -9,6 +9,7 @@ record, the same head. All other listed records are read and checked again.
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -40,7 +41,7 @@ PINNED = ("capture", "model", "registration")
 # (kind, take) -> reference to the version in the provenance
 Pins = Mapping[tuple[str, str], Mapping[str, Any]]
 CATALOGUE = "catalogue.json"
-CACHE_FORMAT = 3
+CACHE_FORMAT = 4
 # threads that read records; a bucket takes some 20 ms per record, whatever its size
 READER_THREADS = 32
 # parts of a provenance that the catalogue shows or uses
@@ -53,6 +54,9 @@ CACHED_PARTS = (
     "parameters",
     "dictionary",
     "dictionary_digest",
+    "even_reflection",
+    "even_reflection_error",
+    "summary_parameters",
     "status",
     "consent_scope",
 )
@@ -60,6 +64,8 @@ CACHED_PARTS = (
 KINDS_WITH_INPUTS = ("model",)
 # kinds whose cached records contain all that `Staleness` needs
 CACHED_KINDS = ("capture", *KINDS_WITH_INPUTS, CONSENT)
+# groups that cohorts need the layout of
+CACHED_GROUPS = {"capture": ("dome", "samples"), "model": ("tables", "sample")}
 # cached fields of a record
 CACHED_FIELDS = (
     "kind",
@@ -254,7 +260,7 @@ class Lookup:
 
     def generation(self, kind: str, take: str, generation: int) -> Record:
         """The record of any generation."""
-        return self._snapshot.record(kind, take, generation)
+        return self._source.record(kind, take, generation)
 
     def about(self, take: str) -> dict[str, Any]:
         """Provenance of the capture of a take, or of its model if there is no capture."""
@@ -450,14 +456,10 @@ class RecordCache:
             for _, entry in sorted(entries.items())
             if self._markers.admits(entry.record)
         ]
-        names = {
-            entry.record.names: number for number, entry in enumerate(rows)
-        }  # takes registered together share them
-        body: dict[str, Any] = {
-            "format": CACHE_FORMAT,
-            "names": {str(number): those for those, number in names.items()},
-        }
-        body["records"] = [_row(entry, names) for entry in rows]
+        # most takes have the same groups, and those registered together the same names
+        shared: dict[str, int] = {}
+        records = [_row(entry, shared) for entry in rows]
+        body = {"format": CACHE_FORMAT, "shared": [*shared], "records": records}
         # for example a read-only folder: the next query reads the log again
         with suppress(OSError, InputError):
             guard = self._require_same_markers
@@ -567,10 +569,12 @@ def _load_entries(place: Place) -> dict[Key, Entry] | None:
         body = sealed_object(place.read_small(CATALOGUE))
         if body["format"] != CACHE_FORMAT:
             return None
-        names = {number: tuple(takes) for number, takes in body["names"].items()}
+        shared = [json.loads(text) for text in body["shared"]]
         entries = {}
         for row in body["records"]:
-            record = Record(**row["record"], names=names[str(row["names"])])
+            names = tuple(shared[row["names"]])
+            contents = shared[row["contents"]]
+            record = Record(**row["record"], names=names, contents=contents)
             key = (record.kind, record.take, record.generation)
             entries[key] = Entry(record, str(row["file"]), row["head"])
         return entries
@@ -586,16 +590,23 @@ def _trimmed_record(record: Record) -> Record:
         name: record.provenance[name] for name in parts if name in record.provenance
     }
     fields = {name: getattr(record, name) for name in CACHED_FIELDS}
-    return Record(**fields, names=record.names, provenance=provenance)
+    contents = {
+        name: record.contents[name]
+        for name in CACHED_GROUPS.get(record.kind, ())
+        if name in record.contents
+    }
+    return Record(
+        **fields, names=record.names, contents=contents, provenance=provenance
+    )
 
 
-def _row(entry: Entry, names: Mapping[tuple[str, ...], int]) -> dict[str, Any]:
+def _row(entry: Entry, shared: dict[str, int]) -> dict[str, Any]:
+    """A row of the cache; values of `names` and `contents` are added to `shared`."""
     record = {
         name: getattr(entry.record, name) for name in (*CACHED_FIELDS, "provenance")
     }
-    return {
-        "record": record,
-        "names": names[entry.record.names],
-        "file": entry.file,
-        "head": entry.head,
+    parts = {
+        name: shared.setdefault(json.dumps(getattr(entry.record, name)), len(shared))
+        for name in ("names", "contents")
     }
+    return {"record": record, "file": entry.file, "head": entry.head, **parts}

@@ -305,6 +305,8 @@ def _difference(place: Place, key: str, size: int, file: Committed) -> str:
 
 def _record_faults(place: Place, record: Record, tables: bytes) -> list[Fault]:
     """Faults of a record that does not agree with the attributes of its version."""
+    store = VerifiedStore(place, record)
+    tree = xr.open_datatree(store, engine="zarr", consolidated=False, chunks=None)  # type: ignore[arg-type]
     root = json_object(place.read_small(f"{record.path}/zarr.json"))
     wrong = [] if root.get("attributes") == record.provenance else ["provenance"]
     if record.kind not in KINDS_OF_ONE_SUBJECT:
@@ -313,8 +315,6 @@ def _record_faults(place: Place, record: Record, tables: bytes) -> list[Fault]:
             if read_names(place, record.path) == ([*record.names], record.admissions)
             else ["names"]
         )
-    store = VerifiedStore(place, record)
-    tree = xr.open_datatree(store, engine="zarr", consolidated=False, chunks=None)  # type: ignore[arg-type]
     contents = {
         str(name): describe(node.to_dataset()) for name, node in tree.children.items()
     }

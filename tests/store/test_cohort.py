@@ -4,6 +4,8 @@ may lack parts.
 
 from __future__ import annotations
 
+from unittest import mock
+
 import dask
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from skindb import workflow
 from skindb.analysis import sample_surfels
 from skindb.errors import InputError
 from skindb.schema import ProbeStatus
-from skindb.schema.cohort import Held, column, combine
+from skindb.schema.cohort import MAX_BLOCK_TAKES, Held, Part, column, combine
 from skindb.store import Database
 from skindb.store.cohort import Address, _group
 
@@ -202,6 +204,22 @@ def test_table__one_row_a_take(db):
     assert table.groupby("gender").size()["female"] == 3
 
 
+def test_cohort__the_cache_of_records_changes_nothing(db):
+    """A cohort of all takes is opened from the cache, and one of few takes without it."""
+    cache = db.root / "catalogue.json"
+    few = db.cohort("surfels", takes=[*PEOPLE]).compute()
+    for damage in (None, b"{}", None):
+        cached = db.cohort("surfels").compute()
+        xr.testing.assert_identical(cached, few)
+        assert cache.is_file()
+        if damage is None:
+            with mock.patch("skindb.store.log.Log._read", side_effect=AssertionError):
+                again = db.cohort("surfels")
+            xr.testing.assert_identical(again.compute(), few)
+        else:
+            cache.write_bytes(damage)
+
+
 def test_combine__a_thousand_takes_are_opened_without_being_read():
     class Never:
         def read(self, name):
@@ -217,8 +235,52 @@ def test_combine__a_thousand_takes_are_opened_without_being_read():
     ]
     cohort = combine(parts)
     assert cohort.sizes == {"take": 1000, "region": 3}
+    assert len(cohort.__dask_graph__()) == 1 + -(-1000 // MAX_BLOCK_TAKES)
     with pytest.raises(AssertionError), dask.config.set(scheduler="synchronous"):
         cohort["region_area"][5].compute()
+
+
+def test_combine__only_the_selected_takes_are_read():
+    """Whatever the number of takes in a block, whose values are in memory together."""
+    reads = []
+
+    class Noted:
+        def __init__(self, number):
+            self.number = number
+
+        def read(self, name):
+            reads.append(self.number)
+            return xr.DataArray(np.full((2, 3), self.number), dims=("site", "channel"))
+
+    none = {"x": 1}
+    parts = [
+        Part(f"T{i}", none, ["site_sigma_tr"], {"site": 2, "channel": 3}, {}, Noted(i))
+        for i in range(600)
+    ]
+    parts[7] = Part("T7", none, [], {}, {}, Noted(7))
+    values = combine(parts)["site_sigma_tr"]
+    whole = np.broadcast_to(np.arange(600.0)[:, None, None], (600, 2, 3)).copy()
+    whole[7] = np.nan
+    for key in (
+        (5,),
+        (7,),
+        (slice(254, 259), 1),
+        ([300, 2, 2], slice(None), [2, 0]),
+        (slice(None, None, 100), 0, 2),
+        ([], slice(0, 1)),
+    ):
+        reads.clear()
+        chosen = dict(zip(values.dims, key, strict=False))
+        got = values.isel(chosen).compute(scheduler="synchronous").values
+        want = whole
+        for dim, index in reversed([*enumerate(key)]):
+            index = np.asarray(index, int) if isinstance(index, list) else index
+            want = want[(slice(None),) * dim + (index,)]
+        np.testing.assert_array_equal(got, want)
+        takes = {*np.atleast_1d(np.arange(600)[key[0]]).tolist()} if key[0] else set()
+        if not isinstance(key[0], list):
+            assert {*reads} == takes - {7}, key
+    np.testing.assert_array_equal(values.values, whole)
 
 
 def test_combine__labels_of_all_takes_together():

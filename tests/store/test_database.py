@@ -410,7 +410,7 @@ DEATHS = {
         "skindb.store.folder.Folder.make_durable = die",
         1,
     ),
-    "while flushing": ("skindb.store.folder.Folder.digest = die", 1),
+    "while flushing": ("skindb.store.folder.Folder.digests = die", 1),
     "record written, not linked": (
         "os.link = lambda a, b: die() if 'log' in Path(b).parts else link(a, b)",
         1,
