@@ -42,6 +42,7 @@ from skindb.schema import FitStatus, Use, dataset, label, names_of
 from skindb.schema.cohort import EVEN
 from skindb.schema.consent import honour_consent
 from skindb.schema.label import take_attrs
+from skindb.threads import on_one_blas_thread
 from skindb.types import Progress
 
 COMPILING = "compiling, only after an installation"
@@ -101,6 +102,7 @@ def fit_model(
     return second_pass(capture, first, dictionary=dictionary, progress=progress)
 
 
+@on_one_blas_thread
 def first_pass(
     capture: xr.DataTree,
     parameters: FitParameters | None = None,
@@ -196,6 +198,7 @@ def _fit_surfels(
     return estimates.merge(terms).compute()
 
 
+@on_one_blas_thread
 def second_pass(
     capture: xr.DataTree,
     first: xr.DataTree,

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from planted_skin import SIGMA_A, SIGMA_S, capture_of
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from skindb.errors import InputError
 from skindb.fit import (
@@ -62,15 +63,34 @@ def planted(skin, small_dictionary, plant):
 
 
 @pytest.fixture(scope="module")
-def fitted(planted, small_dictionary):
+def blas_threads():
+    """Numbers of threads of BLAS in the stages of `fitted`."""
+    return set()
+
+
+@pytest.fixture(scope="module")
+def fitted(planted, small_dictionary, blas_threads):
     steps = []
-    model = fit_model(
-        planted,
-        HELD_OUT,
-        dictionary=small_dictionary,
-        progress=lambda stage, done, total: steps.append((stage, done, total)),
-    )
+
+    def progress(*step):
+        steps.append(step)
+        blas_threads.update(
+            pool["num_threads"]
+            for pool in threadpool_info()
+            if pool["user_api"] == "blas"
+        )
+
+    with threadpool_limits(2):
+        model = fit_model(
+            planted, HELD_OUT, dictionary=small_dictionary, progress=progress
+        )
     return model, steps
+
+
+def test_fit_model__uses_one_thread_of_blas(fitted, blas_threads):
+    """Two of them take 20 times as long for the reduced basis, and other results."""
+    assert {stage for stage, *_ in fitted[1]} >= STAGES - {"translucency"}
+    assert blas_threads == {1}
 
 
 @pytest.mark.slow
