@@ -53,7 +53,7 @@ def steps(url: str, values: np.ndarray):
     begin = clock()
     samples = Database(url).read("capture", "A1")[NAME]
     samples[:: BLOCK_SURFELS // 2, :3].compute()
-    yield "read two chunks of every shard", clock() - begin
+    yield "read two chunks of every block", clock() - begin
     begin = clock()
     assert Database(url).verify() == []
     yield "verify", clock() - begin

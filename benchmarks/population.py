@@ -30,13 +30,19 @@ from skindb.store import Database, Record
 from skindb.store.log import Log
 from skindb.store.record import record_to_json
 
+
+def means(db: Database) -> np.ndarray:
+    """Open the cohort, and compute the means of R_d of two groups."""
+    values = db.cohort("tables").region_diffuse_reflectance
+    return np.asarray(values.groupby("gender").mean().values)
+
+
 GROUPS = {"capture": ("dome",), "model": ("sample",)}
 STEPS: dict[str, Callable[[Database], Any]] = {
     "cohort, first time": lambda db: db.cohort("tables"),
     "cohort of tables": lambda db: db.cohort("tables"),
-    "one variable of it": lambda db: (
-        db.cohort("tables").region_diffuse_reflectance.groupby("gender").mean().values
-    ),
+    "one variable, first time": means,
+    "one variable of it": means,
     "cohort of surfels": lambda db: db.cohort("surfels", surfels=200),
     "one variable of one take": lambda db: (
         db.cohort("surfels", surfels=200).basis_weight.isel(take=-1).values
@@ -155,7 +161,9 @@ def main(
         return
     root = work / f"population{takes}"
     grow(skindb.open(db), take, root, takes)
-    (root / "catalogue.json").unlink(missing_ok=True)
+    place = skindb.open(root).place
+    for cache in ("catalogue.json", "gathered"):
+        place.remove(cache)
     for name in STEPS:
         run = [
             sys.executable,

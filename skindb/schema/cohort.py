@@ -6,6 +6,7 @@ import unicodedata
 import uuid
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Protocol
 
 import dask.array as da
@@ -87,6 +88,7 @@ class Held:
         )
 
 
+@lru_cache
 def imitates_column(name: str) -> bool:
     """Whether the name of an attribute is that of another column of the catalogue, or
     looks like it.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Literal
 
@@ -22,19 +22,21 @@ from skindb.schema.cohort import (
 )
 from skindb.schema.notes import Note, note, note_lines
 from skindb.store.arrays import open_group
-from skindb.store.bucket import place_at
-from skindb.store.log import RESTORE
-from skindb.store.place import SUMMARY, Located, Place
-from skindb.store.record import AS_RECORDED, Record
-from skindb.store.snapshot import Lookup, Snapshot
-from skindb.store.stage import describe, read_tables
+from skindb.store.gathered import (
+    Address,
+    StoredTables,
+    require_recorded,
+    table_sources,
+)
+from skindb.store.place import SUMMARY, Located
+from skindb.store.record import Record
+from skindb.store.snapshot import READER_THREADS, Lookup
 
 Layout = Literal["tables", "surfels", "maps"]
 GROUP: dict[str, str] = {"tables": "tables", "surfels": "sample", "maps": "maps"}
 SAMPLES = "reflectance_sample"
 DOME = ("light_position", "camera_position")
-# cached by a process; the tables of a take have some 20 kB, and open groups hold no values
-MAX_OPEN_TABLES = 2048
+# cached by a process; open groups hold no values
 MAX_OPEN_GROUPS = 512
 
 
@@ -47,52 +49,6 @@ class CohortRequest:
     size: int = 512
     seed: int = 0
     digest: str = ""  # of the code that computed the summary; empty for any
-
-
-@dataclass(frozen=True)
-class Address:
-    """Address of a version, with which another process finds it and detects changes."""
-
-    url: str  # of the database
-    kind: str
-    take: str
-    generation: int
-    seal: str
-
-    @classmethod
-    def of(cls, place: Place, record: Record) -> Address:
-        """The address of the version of a record."""
-        url = place.address()
-        return cls(url, record.kind, record.take, record.generation, record.seal)
-
-    @property
-    def place(self) -> Place:
-        """Location of the database."""
-        return _place(self.url)
-
-    def record(self) -> Record:
-        """The record at this address; `InputError` if its seal differs."""
-        snapshot = Snapshot(self.place)
-        record = snapshot.record(self.kind, self.take, self.generation)
-        require(
-            record.seal == self.seal,
-            f"{self.kind} of {self.take}",
-            "a version must not change while a cohort refers to it",
-            "a different version of that generation",
-            "open the cohort again",
-        )
-        return record
-
-
-@dataclass(frozen=True)
-class StoredTables:
-    """The tables beside a version as a source of variables."""
-
-    address: Address
-
-    def read(self, name: str) -> xr.DataArray:
-        """Values of a variable of the tables."""
-        return _tables(self.address)[name]
 
 
 @dataclass(frozen=True)
@@ -169,6 +125,13 @@ def cohort(
         _part(lookup, records[take], version, request, chosen)
         for take, version in stored.items()
     ]
+    if layout == "tables" and len(parts) > READER_THREADS:
+        addresses = [Address.of(lookup.place, version) for version in stored.values()]
+        sources = table_sources(addresses)
+        parts = [
+            replace(part, source=source)
+            for part, source in zip(parts, sources, strict=True)
+        ]
     if empty := [
         part.take
         for part in parts
@@ -264,7 +227,7 @@ def _members(
     """Takes that the cohort may use, and one note for each skipped take."""
     available = sorted(lookup.takes(kind))
     names = available if takes is None else list(dict.fromkeys(takes))
-    if unknown := [take for take in names if take not in available]:
+    if unknown := [take for take in names if not lookup.has(kind, take)]:
         rule = f"every take of a cohort must have a {kind}"
         cure = f"takes with one: {', '.join(available) or 'none'}"
         raise InputError(Fault(take, rule, "none", cure) for take in unknown)
@@ -463,28 +426,7 @@ def _without_variables(part: Part, names: Iterable[str]) -> Part:
     return Part(part.take, part.coords, remaining, part.sizes, part.labels, part.source)
 
 
-@lru_cache(MAX_OPEN_TABLES)
-def _tables(address: Address) -> xr.Dataset:
-    record = address.record()
-    return _require_recorded(record, "tables", read_tables(address.place, record))
-
-
 @lru_cache(MAX_OPEN_GROUPS)
 def _group(address: Address, name: str) -> xr.Dataset:
     record = address.record()
-    return _require_recorded(record, name, open_group(address.place, record, name))
-
-
-@lru_cache
-def _place(url: str) -> Place:
-    return place_at(url)
-
-
-def _require_recorded(record: Record, name: str, ds: xr.Dataset) -> xr.Dataset:
-    """Return the group, which must match the description in its record that defines the
-    layout of the cohort.
-    """
-    if name in record.contents and describe(ds) != record.contents[name]:
-        title = record.title
-        raise input_error(title, AS_RECORDED, f"a different group {name}", RESTORE)
-    return ds
+    return require_recorded(record, name, open_group(address.place, record, name))

@@ -19,6 +19,7 @@ from skindb.errors import InputError, input_error
 from skindb.schema.consent import CONSENT
 from skindb.store.decisions import commit_release
 from skindb.store.folder import remove_tree
+from skindb.store.gathered import blocks_of
 from skindb.store.lease import Lease
 from skindb.store.log import Log, committed_logs, takes_below
 from skindb.store.markers import Markers, mark_withdrawn, note_withdrawals, read_markers
@@ -137,7 +138,10 @@ def holdings_of(place: Place, markers: Markers) -> Holdings:
             if request.without(markers.is_withdrawn) != request
         ),
         scratch=tuple(_scratch(place, markers)),
-        caches=(CATALOGUE,) if cache_names(place, markers.is_withdrawn) else (),
+        caches=(
+            *([CATALOGUE] if cache_names(place, markers.is_withdrawn) else []),
+            *blocks_of(place, markers.is_withdrawn),
+        ),
     )
 
 

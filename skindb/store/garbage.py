@@ -13,6 +13,7 @@ from skindb.errors import InputError, input_error
 from skindb.limits import RESUMABLE_SECONDS
 from skindb.schema.consent import CONSENT
 from skindb.store.erasure import SCRATCH_NAME, erase_withdrawn, holdings_of
+from skindb.store.gathered import GATHERED
 from skindb.store.lease import NUMBER, Lease, abandoned_holder, holder_of, storage_time
 from skindb.store.log import Log, committed_logs, takes_below
 from skindb.store.markers import Markers, read_markers
@@ -72,6 +73,7 @@ def find_garbage(place: Place, generations: int | None = None) -> list[Garbage]:
         *_of_withdrawn_subjects(place, markers),
         *_temporary_files(place, now),
         *_scratch_folders(place, now),
+        *_old_blocks(place, now),
     ]
     unrecorded = partial(_unrecorded, tombstone_names=tombstones(place))
     for key, of_take in (("data", unrecorded), ("leases", _abandoned_leases)):
@@ -277,6 +279,15 @@ def _temporary_files(place: Place, now: Clock) -> Iterator[Garbage]:
         if size >= 0:
             reason = _recent_reason(place, [key], now)
             yield Garbage(key, "a temporary file of a killed writer", size, reason)
+
+
+def _old_blocks(place: Place, now: Clock) -> Iterator[Garbage]:
+    """Gathered tables, which may be outdated and are gathered again."""
+    sizes = place.sizes(GATHERED) if place.file_type(GATHERED) == "folder" else {}
+    for name, size in sizes.items():
+        key = f"{GATHERED}/{name}"
+        if size >= 0 and not _recent_reason(place, [key], now, RESUMABLE_SECONDS):
+            yield Garbage(key, "tables that studies have gathered", size)
 
 
 def _scratch_folders(place: Place, now: Clock) -> Iterator[Garbage]:

@@ -462,20 +462,8 @@ class RecordCache:
         body = {"format": CACHE_FORMAT, "shared": [*shared], "records": records}
         # for example a read-only folder: the next query reads the log again
         with suppress(OSError, InputError):
-            guard = self._require_same_markers
+            guard = partial(require_same_markers, self.place, self._markers, CATALOGUE)
             self.place.replace(CATALOGUE, sealed(body), guard=guard)
-
-    def _require_same_markers(self) -> None:
-        """Raise a `WithdrawnError` if a subject was withdrawn since this query began."""
-        if read_markers(self.place) != self._markers:
-            raise WithdrawnError(
-                Fault(
-                    self.place.where(CATALOGUE),
-                    "no subject must be withdrawn while the cache is written",
-                    "a withdrawal",
-                    "run the command again",
-                )
-            )
 
     def _entry(self, kind: str, take: str, generation: int | None) -> Entry | None:
         """Cached entry of a version; None if its files have changed."""
@@ -520,6 +508,19 @@ class RecordCache:
 
 
 Records = Snapshot | RecordCache  # a source of takes and records
+
+
+def require_same_markers(place: Place, markers: Markers, key: str) -> None:
+    """Raise a `WithdrawnError` if a subject was withdrawn since these markers were read."""
+    if read_markers(place) != markers:
+        raise WithdrawnError(
+            Fault(
+                place.where(key),
+                "no subject must be withdrawn while the cache is written",
+                "a withdrawal",
+                "run the command again",
+            )
+        )
 
 
 def cache_names(place: Place, is_named: Callable[[str], bool]) -> bool:

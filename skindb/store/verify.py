@@ -11,6 +11,8 @@ import xarray as xr
 from skindb.errors import Fault, InputError
 from skindb.store.audit import BLOCK_NAME, ENTRY_NAME, read_audit
 from skindb.store.erasure import holdings_of
+from skindb.store.gathered import BLOCK_NAME as GATHERED_NAME
+from skindb.store.gathered import GATHERED
 from skindb.store.lease import NUMBER, abandoned_holder
 from skindb.store.log import GENERATION, RESTORE, Log, committed_logs, tombstone_of
 from skindb.store.markers import SECRET, WITHDRAWN, marker_faults, read_markers
@@ -51,6 +53,7 @@ LAYOUT = {
     WITHDRAWN: (r"[0-9a-f]{64}", r"[0-9]{4}\.json"),
     AUDIT: (BLOCK_NAME, ENTRY_NAME),
     REQUESTS: (REQUEST_NAME,),
+    GATHERED: (GATHERED_NAME,),
 }
 THREADS = 8  # that read files; a server answers many requests in parallel
 FILE_BESIDE = re.compile(r"\.(manifest|tables)\.json")

@@ -1,0 +1,192 @@
+"""Tables of many takes in one file, so that a study does not read thousands of them.
+
+A block of tables is a cache, `gathered/<digest>.npz`, which is named after the seals of
+the versions that it was made from: a block of other versions is never found. It is
+written only while no subject was withdrawn since its tables were read, and a withdrawal
+removes the blocks that hold the subject, and those that cannot be read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from skindb.errors import InputError, input_error, require
+from skindb.schema.cohort import TAKE, Held, combine
+from skindb.schema.variables import VARIABLES
+from skindb.store.bucket import place_at
+from skindb.store.log import RESTORE
+from skindb.store.markers import read_markers
+from skindb.store.place import Place, subject_of
+from skindb.store.record import AS_RECORDED, Record, intact_or_none
+from skindb.store.snapshot import Snapshot, require_same_markers
+from skindb.store.stage import describe, read_tables
+
+GATHERED = "gathered"
+BLOCK_NAME = r"[0-9a-f]{64}\.npz"
+GATHERED_TAKES = 256  # in a block
+DIGEST_BYTES = 32  # before the content of a block
+# cached by a process; the tables of a take have some 20 kB, blocks 3 kB for each take
+MAX_OPEN_TABLES = 2048
+MAX_OPEN_BLOCKS = 64
+
+
+@dataclass(frozen=True)
+class Address:
+    """Address of a version, with which another process finds it and detects changes."""
+
+    url: str  # of the database
+    kind: str
+    take: str
+    generation: int
+    seal: str
+
+    @classmethod
+    def of(cls, place: Place, record: Record) -> Address:
+        """The address of the version of a record."""
+        url = place.address()
+        return cls(url, record.kind, record.take, record.generation, record.seal)
+
+    @property
+    def place(self) -> Place:
+        """Location of the database."""
+        return _place(self.url)
+
+    def record(self) -> Record:
+        """The record at this address; `InputError` if its seal differs."""
+        snapshot = Snapshot(self.place)
+        record = snapshot.record(self.kind, self.take, self.generation)
+        require(
+            record.seal == self.seal,
+            f"{self.kind} of {self.take}",
+            "a version must not change while a cohort refers to it",
+            "a different version of that generation",
+            "open the cohort again",
+        )
+        return record
+
+
+@dataclass(frozen=True)
+class Block:
+    """The tables of some versions."""
+
+    key: str  # of the file
+    addresses: tuple[Address, ...] = field(compare=False, repr=False)
+
+
+@dataclass(frozen=True)
+class StoredTables:
+    """The tables beside a version as a source of variables."""
+
+    address: Address
+    block: Block | None = None  # that holds them too
+    index: int = 0  # in the block
+
+    def read(self, name: str) -> xr.DataArray:
+        """Values of a variable of the tables."""
+        if self.block is None:
+            return _tables(self.address)[name]
+        return _opened(self.block)[name][self.index]
+
+
+def table_sources(addresses: Sequence[Address]) -> list[StoredTables]:
+    """Sources of the tables of takes, which share blocks."""
+    sources = []
+    for start in range(0, len(addresses), GATHERED_TAKES):
+        part = tuple(addresses[start : start + GATHERED_TAKES])
+        seals = "\n".join(one.seal for one in part)
+        digest = hashlib.sha256(seals.encode()).hexdigest()
+        block = Block(f"{GATHERED}/{digest}.npz", part)
+        sources += [StoredTables(one, block, i) for i, one in enumerate(part)]
+    return sources
+
+
+def blocks_of(place: Place, is_named: Callable[[str], bool]) -> list[str]:
+    """Blocks that may hold the tables of a subject for whom `is_named` is true."""
+    is_folder = place.file_type(GATHERED) == "folder"
+    keys = [f"{GATHERED}/{name}" for name in place.children(GATHERED) if is_folder]
+    blocks = {key: intact_or_none(partial(_stored, place, key)) for key in keys}
+    return [
+        key
+        for key, block in blocks.items()
+        if block is None or any(is_named(subject_of(take)) for take in _takes(block))
+    ]
+
+
+def _takes(block: xr.Dataset) -> list[str]:
+    return [str(take) for take in block[TAKE].values]
+
+
+@lru_cache(MAX_OPEN_BLOCKS)
+def _opened(block: Block) -> xr.Dataset:
+    place = block.addresses[0].place
+    stored = intact_or_none(partial(_stored, place, block.key))
+    if stored is not None:
+        return stored
+    markers = read_markers(place)
+    parts = [Held.part(one.take, {}, _tables(one)) for one in block.addresses]
+    gathered = combine(parts).compute(scheduler="synchronous")
+    # for example a read-only folder: the next study reads the versions again
+    with suppress(OSError, InputError):
+        guard = partial(require_same_markers, place, markers, block.key)
+        place.replace(block.key, _packed(block.key, gathered), guard=guard)
+    return gathered
+
+
+def _packed(key: str, block: xr.Dataset) -> bytes:
+    """Content of the file of a block."""
+    arrays: dict[str, Any] = {
+        str(name): v.values for name, v in block.variables.items()
+    }
+    for name, values in arrays.items():
+        if values.dtype.kind not in "fiub":
+            arrays[name] = np.array(values.tolist(), "U")
+    content = io.BytesIO()
+    np.savez(content, allow_pickle=False, **arrays)
+    return _digest(key, content.getvalue()) + content.getvalue()
+
+
+def _digest(key: str, content: bytes) -> bytes:
+    """Digest by which a damaged block, or that of other versions, is detected."""
+    return hashlib.sha256(key.encode() + b"\0" + content).digest()
+
+
+def _stored(place: Place, key: str) -> xr.Dataset:
+    """The block in a file; `ValueError` if the file is damaged."""
+    content = place.read(key)
+    if _digest(key, content[DIGEST_BYTES:]) != content[:DIGEST_BYTES]:
+        raise ValueError("content that does not match its digest")
+    with np.load(io.BytesIO(content[DIGEST_BYTES:]), allow_pickle=False) as arrays:
+        values = {name: arrays[name] for name in arrays.files}
+    coords = {name: values.pop(name) for name in [*values] if name not in VARIABLES}
+    dims = {name: (TAKE, *VARIABLES[name].dims) for name in values}
+    return xr.Dataset({name: (dims[name], values[name]) for name in values}, coords)
+
+
+@lru_cache(MAX_OPEN_TABLES)
+def _tables(address: Address) -> xr.Dataset:
+    record = address.record()
+    return require_recorded(record, "tables", read_tables(address.place, record))
+
+
+@lru_cache
+def _place(url: str) -> Place:
+    return place_at(url)
+
+
+def require_recorded(record: Record, name: str, ds: xr.Dataset) -> xr.Dataset:
+    """Return the group, which must match the description in its record that defines the
+    layout of the cohort.
+    """
+    if name in record.contents and describe(ds) != record.contents[name]:
+        title = record.title
+        raise input_error(title, AS_RECORDED, f"a different group {name}", RESTORE)
+    return ds
