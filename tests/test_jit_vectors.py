@@ -112,17 +112,17 @@ def test_half__every_one(calls):
 
 
 PRINT_FIT = """
-import numpy as np
 from planted_skin import make_skin
-from skindb.reflectance.mixture import Mixture
-from skindb.fit import estimate_diffuse_reflectance, estimate_normals, fit_surface
+from skindb.fit import fit_surface
 from skindb.reflectance.dictionary import embedded_dictionary
-lumitexels = make_skin(surfels=5, lights=40, cameras=6).lumitexels
-found = estimate_normals(lumitexels)
-found = found.merge(estimate_diffuse_reflectance(lumitexels.merge(found)))
+from skindb.reflectance.mixture import Mixture
+from skindb.schema import dataset
+skin = make_skin(surfels=5, lights=40, cameras=6)
+planted = {"shading_normal": skin.normal, "diffuse_reflectance": skin.diffuse}
+lumitexels = skin.lumitexels.merge(dataset(planted))
 surface = Mixture.of_dictionary(embedded_dictionary(), rank=8)
-found = found.merge(fit_surface(lumitexels.merge(found), surface=surface))
-for name in ("shading_normal", "diffuse_reflectance", "dictionary_residual"):
+found = fit_surface(lumitexels, surface=surface)
+for name in ("dictionary_residual", "dictionary_residual_perceptual"):
     print(*found[name].values.ravel())
 """
 

@@ -108,10 +108,11 @@ class _Regression:
         explained = np.einsum("bcq,cd,bdq->bq", along, gram, along, optimize=True)
         squares = total - 2 * cross + explained
         statistics = _ratio(along[:, -1], np.sqrt(np.maximum(squares, 0.0)))
-        for draw, column in np.argwhere(squares <= CANCELLED * total):
-            values = self.values[order[draw], column] * sign[draw]
-            exact = self.statistics(values[None, :, None])
-            statistics[draw, column] = exact[0, 0]
+        cancelled = squares <= CANCELLED * total
+        for draw in np.flatnonzero(cancelled.any(axis=1)):
+            columns = np.flatnonzero(cancelled[draw])
+            values = self.values[np.ix_(order[draw], columns)] * sign[draw][:, None]
+            statistics[draw, columns] = self.statistics(values[None])[0]
         return statistics
 
 
