@@ -66,6 +66,11 @@ def inline_fast_kernel(function: Function) -> Function:
     )
 
 
+def is_stored(compiled: Any) -> bool:
+    """Whether the disk has a kernel as Python calls it."""
+    return not compiled.entry.files.is_empty()
+
+
 @contextmanager
 def reported_compilation(call: Callable[[], None]) -> Iterator[None]:
     """Call `call` before each kernel that is compiled instead of read from the disk, as

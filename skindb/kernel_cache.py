@@ -48,6 +48,11 @@ class KernelFiles(IndexDataCacheFile):  # type: ignore[misc]
             return self._load_data(self._file(key))
         return None
 
+    def is_empty(self) -> bool:
+        """Whether no signature of the present code is stored."""
+        prefix = f"{self.name}-{digest(self.compiled)[:16]}"
+        return not any(Path(self._cache_path).glob(f"{prefix}.*.nbc"))
+
     def save(self, key: tuple[Any, ...], data: Any) -> None:
         """Store a compiled signature."""
         current = self._file(key)

@@ -26,7 +26,8 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         self.entry = Entry(function, targetoptions=options | {"no_cfunc_wrapper": True})
         for dispatcher in (self, self.entry):
             dispatcher.enable_caching()
-            dispatcher._cache._cache_file = KernelFiles(dispatcher)
+            dispatcher.files = KernelFiles(dispatcher)
+            dispatcher._cache._cache_file = dispatcher.files
 
     def __call__(self, *args: Any, **options: Any) -> Any:
         """Call the kernel from Python."""

@@ -111,6 +111,8 @@ def fit(
     results: dict[str, Any] = {}
     faults: list[Fault] = []
     if chosen:
+        if scheduler is None and not explain:
+            skindb.fit.compile_kernels(progress)
         with workflow.logged_action(
             database, "fit", chosen, arguments={"refit": refit, "explain": explain}
         ):

@@ -13,6 +13,7 @@ from skindb.elementwise import thread_count
 from skindb.errors import input_error
 from skindb.export.bundle import export_bundle
 from skindb.files import make_private, private_file
+from skindb.fit import compile_kernels
 from skindb.parameters import DemoParameters, FitParameters, SimulationParameters
 from skindb.render.photographs import compare_photographs
 from skindb.store import Database
@@ -102,9 +103,10 @@ def run_demo(
 def _make_takes(
     out: Path, parameters: DemoParameters, workers: int, progress: Progress
 ) -> Results:
-    """The results of all takes. The first one is made alone, as it compiles the kernels
-    that the others use.
+    """The results of all takes. The first one is made alone, as it compiles kernels that
+    the others use.
     """
+    compile_kernels(progress)
     results = Results()
     make = partial(_make_take, out=out, parameters=parameters)
     results.add(make(0, progress=progress))

@@ -5,6 +5,7 @@ translucency.
 from skindb.fit.albedo import estimate_diffuse_reflectance
 from skindb.fit.corrections import estimate_light_gains
 from skindb.fit.joint import refine_jointly
+from skindb.fit.kernels import compile_kernels
 from skindb.fit.lumitexels import lumitexels, sample_variance
 from skindb.fit.model import first_pass, fit_model, second_pass
 from skindb.fit.normals import estimate_normals
@@ -31,6 +32,7 @@ from skindb.reflectance.reduction import reduce_basis
 __all__ = [
     "FitParameters",
     "FitPlan",
+    "compile_kernels",
     "describe_prediction",
     "dictionary_report",
     "embedded_dictionary",

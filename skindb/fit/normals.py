@@ -63,7 +63,7 @@ def estimate_normals(
         raise ValueError(f"method must be one of {METHODS}, not {method!r}")
     check(lumitexels, (*GEOMETRY, "surfel_normal"), where="lumitexels")
     return elementwise(
-        _normals,
+        surfel_normals,
         lumitexels,
         over="surfel",
         inputs=(*GEOMETRY, "surfel_normal"),
@@ -79,7 +79,7 @@ def estimate_normals(
     )
 
 
-def _normals(
+def surfel_normals(
     sample: Array,
     position: Array,
     light: Array,

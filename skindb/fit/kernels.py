@@ -1,0 +1,71 @@
+"""Compilation of the largest kernels of fits, in several processes after an installation."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor, as_completed
+
+import numpy as np
+
+from skindb.elementwise import thread_count
+from skindb.fit.model import COMPILING
+from skindb.fit.normals import METHODS, surfel_normals
+from skindb.jit import is_stored
+from skindb.reflectance._block_kernels import fit_block, judge_block
+from skindb.reflectance._ggx_kernels import fit_ggx, judge_ggx
+from skindb.reflectance._joint_kernels import fit_jointly
+from skindb.reflectance.ggx import GGX
+from skindb.reflectance.joint import refine_block
+from skindb.reflectance.mixture import Mixture
+from skindb.reflectance.model import Block, Comparison, FitRequest, Judgement
+from skindb.reflectance.separation import separate_diffuse
+from skindb.types import Progress, silent
+
+STEPS = ("joint", "diffuse", "mixture", "ggx", "normals")  # the longest first
+
+
+def compile_kernels(progress: Progress = silent) -> None:
+    """Compile the kernels that fits spend the most time to compile, where they are not
+    stored yet; the others are compiled at their first use.
+    """
+    kernels = (fit_jointly, fit_block, judge_block, fit_ggx, judge_ggx)
+    if all(is_stored(kernel) for kernel in kernels):
+        return
+    progress(COMPILING, 0, len(STEPS))
+    with ThreadPoolExecutor(thread_count()) as pool:
+        calls = [pool.submit(_compile_apart, step) for step in STEPS]
+        for done, call in enumerate(as_completed(calls), 1):
+            call.result()
+            progress(COMPILING, done, len(STEPS))
+
+
+def _compile_apart(step: str) -> None:
+    subprocess.run([sys.executable, "-m", __name__, step], check=True)
+
+
+def compile_step(step: str) -> None:
+    """Compile the kernels of one of the STEPS, by a fit of no surfels."""
+    none = np.zeros((0, 3))
+    one = np.zeros((1, 3))
+    sample = np.zeros((0, 1, 1, 3), np.float16)
+    block = Block(sample, none, one, one, none, none)
+    comparison = Comparison()
+    held = np.zeros((1, 1), np.int64)
+    judgement = Judgement(none, np.zeros(0), held, outliers=True)
+    match step:
+        case "joint":
+            refine_block(block, comparison, scan_normal=none, scan_error=1.0)
+        case "diffuse":
+            separate_diffuse(block, np.zeros((0, 2)), eta=1.3)
+        case "mixture" | "ggx":
+            kind = Mixture if step == "mixture" else GGX
+            model = kind.unfitted(FitRequest(1.3, 0.0, "perceptual", 16, 4))
+            model.fit(block, comparison)
+            model.judge(block, comparison, judgement)
+        case "normals":
+            surfel_normals(*block[:4], none, method=METHODS[0], eta=1.3, scan_error=3.0)
+
+
+if __name__ == "__main__":
+    compile_step(sys.argv[1])

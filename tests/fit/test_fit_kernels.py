@@ -1,0 +1,37 @@
+"""Compilation of kernels before they are used."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+SIGNATURES = """
+import sys
+import skindb
+from skindb.fit._normal_kernels import normals_block
+from skindb.fit.kernels import STEPS, compile_step
+from skindb.reflectance._block_kernels import fit_block, judge_block
+from skindb.reflectance._ggx_kernels import fit_ggx, judge_ggx
+from skindb.reflectance._joint_kernels import fit_jointly
+from skindb.reflectance._separation_kernels import separate_block
+kernels = (fit_jointly, separate_block, fit_block, judge_block, fit_ggx, judge_ggx, normals_block)
+for step in STEPS:
+    compile_step(step)
+before = [{*kernel.entry.signatures} for kernel in kernels]
+assert all(before)
+skindb.fit.fit_model(skindb.open(sys.argv[1]).read("capture", "S01"))
+print(before == [{*kernel.entry.signatures} for kernel in kernels])
+"""
+
+
+@pytest.mark.slow
+def test_compile_step__compiles_what_fits_use(fitted_database):
+    done = subprocess.run(
+        [sys.executable, "-c", SIGNATURES, fitted_database.url],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout == "True\n", done.stderr
