@@ -50,8 +50,10 @@ def each(read: Callable[[int, int], np.ndarray], parts: list[tuple[int, int]]) -
         read(begin, end)
 
 
-def main(db: str, take: str, *, repeat: int = 5) -> None:
-    """Measure and print."""
+def measure(
+    db: str, take: str, *, repeat: int = 5
+) -> tuple[str, dict[str, tuple[float, float]]]:
+    """Description of the samples; CPU time [s] and speed [MB/s] of every method."""
     database = skindb.open(db)
     record = database.record("capture", take)
     store = VerifiedStore(database.place, record)
@@ -83,14 +85,25 @@ def main(db: str, take: str, *, repeat: int = 5) -> None:
     stored = sum(
         file.size for name, file in store.files.items() if name.startswith(f"{NAME}/c")
     )
-    print(
+    text = (
         f"{plain.shape} samples, {size / 1e6:,.0f} MB; {stored / count:,.0f} bytes "
         f"stored per surfel, {stored / plain.size:.3f} per sample"
     )
+    results = {}
     for name, values in seconds.items():
         part = size if "chunk" not in name else size * chunk / BLOCK_SURFELS
         cpu = median(values)
-        print(f"{name:<36} {cpu:.3f} s of CPU time, {part / 1e6 / cpu:,.0f} MB/s")
+        results[name] = cpu, part / 1e6 / cpu
+    return text, results
+
+
+def main(db: str, take: str, *, repeat: int = 5) -> None:
+    """Measure and print."""
+    text, results = measure(db, take, repeat=repeat)
+    print(text)
+    for name, (cpu, speed) in results.items():
+        print(f"{name:<36} {cpu:.3f} s of CPU time, {speed:,.0f} MB/s")
+    database = skindb.open(db)
     for kind in database.kinds(take):
         one = database.record(kind, take)
         files = VerifiedStore(database.place, one).files
