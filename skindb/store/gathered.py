@@ -132,7 +132,8 @@ def _opened(block: Block) -> xr.Dataset:
     if stored is not None:
         return stored
     markers = read_markers(place)
-    parts = [Held.part(one.take, {}, _tables(one)) for one in block.addresses]
+    # not from memory, which may hold tables of a subject who is withdrawn
+    parts = [Held.part(one.take, {}, _read(one)) for one in block.addresses]
     gathered = combine(parts).compute(scheduler="synchronous")
     # for example a read-only folder: the next study reads the versions again
     with suppress(OSError, InputError):
@@ -171,10 +172,12 @@ def _stored(place: Place, key: str) -> xr.Dataset:
     return xr.Dataset({name: (dims[name], values[name]) for name in values}, coords)
 
 
-@lru_cache(MAX_OPEN_TABLES)
-def _tables(address: Address) -> xr.Dataset:
+def _read(address: Address) -> xr.Dataset:
     record = address.record()
     return require_recorded(record, "tables", read_tables(address.place, record))
+
+
+_tables = lru_cache(MAX_OPEN_TABLES)(_read)
 
 
 @lru_cache

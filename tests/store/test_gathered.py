@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from skindb.errors import InputError
 from skindb.schema import dataset
 from skindb.store import Database, cohort, gathered
 from skindb.store.erasure import erase
@@ -65,7 +66,7 @@ def test_blocks__hold_what_the_versions_hold(db):
     assert not _blocks(db)
     xr.testing.assert_identical(_values(db), want)
     assert len(_blocks(db)) == 3
-    with mock.patch.object(gathered, "_tables", side_effect=AssertionError):
+    with mock.patch.object(gathered, "_read", side_effect=AssertionError):
         xr.testing.assert_identical(_values(db), want)
     assert db.verify() == []
     assert db.garbage() == []
@@ -75,9 +76,7 @@ def test_blocks__a_refit_makes_only_its_own_block_again(db):
     _values(db)
     first = {*_blocks(db)}
     _commit(db, "S3", 9.0)
-    read = gathered._tables.__wrapped__
-    with mock.patch.object(gathered, "_tables", side_effect=read) as tables:
-        tables.cache_clear = lambda: None
+    with mock.patch.object(gathered, "_read", side_effect=gathered._read) as tables:
         values = _values(db)
     assert sorted(call.args[0].take for call in tables.call_args_list) == ["S3", "S4"]
     assert float(values["region_area"].sel(take="S3", region="a")) == 9.0
@@ -138,6 +137,19 @@ def test_erase__a_block_that_is_being_made_is_not_written(db):
 
     with mock.patch.object(gathered, "_packed", withdrawn_meanwhile):
         _values(db)
+    for file in _blocks(db):
+        assert "S2".encode("utf-32-le") not in file.read_bytes()
+    assert db.verify() == []
+
+
+def test_erase__tables_in_memory_make_no_block(db):
+    """A process that read the tables before the withdrawal writes none of them after it."""
+    gathered._opened.cache_clear()
+    before = db.cohort("tables")
+    _without_blocks(db)  # is now in memory
+    erase(db.place, "S2")
+    with pytest.raises(InputError, match="model of S2"):
+        before.compute(scheduler="synchronous")
     for file in _blocks(db):
         assert "S2".encode("utf-32-le") not in file.read_bytes()
     assert db.verify() == []
