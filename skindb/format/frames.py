@@ -429,7 +429,7 @@ def _decode_png(_: Path, content: bytes) -> Frame:
     swap = int(bits == 16 and sys.byteorder == "little")
     values = out.view(np.uint8).reshape(height, -1)
     if size != rows.size or not undo_filters(rows, step, swap, values):
-        raise UnreadableError(DAMAGED)
+        return _decode_any_png(content)  # which ignores data after the last row
     return out
 
 
@@ -439,7 +439,8 @@ def _png_chunks(content: bytes) -> list[tuple[bytes, bytes]]:
     offset = len(PNG_HEAD)
     name = b""
     while name != b"IEND":
-        length, name = struct.unpack_from(">I4s", content, offset)
+        head = content[offset : offset + 8].ljust(8, b"\0")
+        length, name = struct.unpack(">I4s", head)
         end = offset + 8 + length
         digest = imagecodecs.deflate_crc32(content[offset + 4 : end])
         if content[end : end + 4] != digest.to_bytes(4, "big"):

@@ -2,7 +2,9 @@ from __future__ import annotations
 
 import contextlib
 import io
+import struct
 import tracemalloc
+import zlib
 
 import imagecodecs
 import numpy as np
@@ -72,6 +74,37 @@ def test_read_frame__png_of_every_filter(tmp_path, dtype):
             found = read_frame(tmp_path / "a.png")
             assert found.dtype == dtype
             np.testing.assert_array_equal(found, frame.astype(dtype))
+
+
+def png_chunk(name, data):
+    checked = name + data
+    return len(data).to_bytes(4) + checked + zlib.crc32(checked).to_bytes(4)
+
+
+def test_read_frame__data_after_the_last_row_of_a_png_are_ignored(tmp_path):
+    frame, _ = FRAMES["a16.png"]
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in frame)
+    head = struct.pack(">IIBBBBB", 7, 5, 16, 2, 0, 0, 0)
+    begin = b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", head)
+    end = png_chunk(b"IEND", b"")
+    for name, data, whole in (
+        ("rows", rows, True),
+        ("more", rows + bytes(9), True),
+        ("filter", b"\5" + rows[1:], False),
+        ("fewer", rows[:-9], False),
+    ):
+        path = tmp_path / f"{name}.png"
+        path.write_bytes(begin + png_chunk(b"IDAT", zlib.compress(data)) + end)
+        if whole:
+            np.testing.assert_array_equal(read_frame(path), frame)
+        else:
+            with pytest.raises(InputError, match="cut off or damaged"):
+                read_frame(path)
+    path.write_bytes(
+        begin + png_chunk(b"IDAT", zlib.compress(rows)) + b"IEND\xaeB`\x82"
+    )
+    with pytest.raises(InputError, match="cut off or damaged"):
+        read_frame(path)
 
 
 def test_read_frame__every_changed_byte_of_a_png_is_damage_or_no_pixel(tmp_path):
