@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Protocol
 
-import dask.array as da
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
@@ -402,6 +401,9 @@ def _lazy(
     labels: Mapping[str, Sequence[Any]],
 ) -> xr.Variable:
     """A variable of every take, in blocks of few bytes; selected takes are read alone."""
+    # a third of the start-up of `skindb info`, which forms no arrays
+    import dask.array as da
+
     dims = VARIABLES[name].dims
     stack = Stack(
         name,
