@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.calibration._merge_kernels import SATURATED
+from skindb.calibration._merge_kernels import OK, SATURATED
 from skindb.calibration.frame_checks import checked_view, highest_value
 from skindb.calibration.irradiance import light_falloff
 from skindb.calibration.radiance import (
@@ -301,7 +301,8 @@ class _Sampler:
         levels = self.levels
         if count >= MIN_MEDIAN_SAMPLES:
             require(
-                lit,
+                # samples of a strong light may be zero in half precision alone
+                lit or bool((radiance[flag == OK] > 0).any()),
                 f"{self.dome.file}[frames], camera {merger.camera.id}, light {light.id}",
                 "a frame must be bright where its light reaches the face",
                 f"none at {count} surfels",

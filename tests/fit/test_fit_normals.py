@@ -9,8 +9,7 @@ from three_surfels import MATTE, SCALES, surfels, unit
 
 from skindb.errors import InputError
 from skindb.fit import estimate_normals, lumitexels
-from skindb.fit.normals import METHODS
-from skindb.fit.normals import _normals as block_normals
+from skindb.fit.normals import METHODS, surfel_normals
 
 
 def _angles(found, true):
@@ -182,7 +181,7 @@ def _normals(skin, method="combined", *, eta=1.3, scan=None):
     """Normals (3, 3) from a scan that is off by three degrees."""
     scan = _scan(skin) if scan is None else scan
     geometry = skin.position, skin.light, skin.camera, scan
-    return block_normals(
+    return surfel_normals(
         skin.sample, *geometry, method=method, eta=eta, scan_error=3.0
     )[0]
 

@@ -328,7 +328,7 @@ def test_solve_nnls__a_shared_system_compiles_nothing_more():
     rhs = np.array([[1.0, -1.0], [0.2, 0.7]])
     x, *_ = solve_nnls(np.broadcast_to(gram, (2, 2, 2)), rhs)
     np.testing.assert_allclose(x, [[0.5, 0.0], [0.0, 0.7]], atol=1e-12)
-    compiled = _nnls_kernels.solve_many.signatures
+    compiled = _nnls_kernels.solve_many.entry.signatures
     # gram, rhs, x
     assert {kind.layout for one in compiled for kind in one[:3]} == {"C"}
 

@@ -204,8 +204,9 @@ def test_table__one_row_a_take(db):
     assert table.groupby("gender").size()["female"] == 3
 
 
-def test_cohort__the_cache_of_records_changes_nothing(db):
+def test_cohort__the_cache_of_records_changes_nothing(tmp_path):
     """A cohort of all takes is opened from the cache, and one of few takes without it."""
+    db = database(tmp_path, PEOPLE)
     cache = db.root / "catalogue.json"
     few = db.cohort("surfels", takes=[*PEOPLE]).compute()
     for damage in (None, b"{}", None):

@@ -81,7 +81,8 @@ def test_population__of_a_bucket(db):
     for key in keys:
         content = bytes(obstore.get(db.place._store, key).bytes())
         assert WORD.encode() not in content
-        assert b'"A"' not in content
+        # three bytes can be anything in compressed values
+        assert not key.endswith(".json") or b'"A"' not in content
         assert not {"A", "A.lotion", "A.json", "A.lotion.json"} & set(key.split("/"))
     assert stale_versions(db) == []
     assert db.verify() == []
