@@ -3,6 +3,7 @@ comma-separated values, and converts values to JSON.
 """
 
 import csv
+import hashlib
 import io
 import json
 import math
@@ -11,6 +12,7 @@ import re
 import stat
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import cache
 from importlib import resources
 from io import BufferedReader
 from itertools import accumulate
@@ -19,6 +21,7 @@ from typing import Any
 
 from skindb.errors import Fault, InputError, input_error
 
+ROOT = Path(__file__).parent
 PRIVATE = 0o700  # permissions of folders with personal data
 PRIVATE_FILE = 0o600  # and of files
 CURE_MISSING = "copy the file into the folder, or correct its name"
@@ -233,3 +236,17 @@ def plain(value: Any) -> Any:
 def package_json(package: str, name: str) -> Any:
     """Content of a JSON file that stands beside the modules of a package."""
     return json.loads((resources.files(package) / name).read_text(encoding="utf-8"))
+
+
+@cache
+def package_digest(root: Path = ROOT) -> str:
+    """Digest of all source files of skindb, byte by byte: whether two processes run the
+    same program.
+    """
+    digest = hashlib.sha256()
+    for file in sorted(
+        file for end in ("py", "pyi", "json") for file in root.rglob(f"*.{end}")
+    ):
+        name = file.relative_to(root).as_posix()
+        digest.update(name.encode() + b"\0" + file.read_bytes() + b"\0")
+    return digest.hexdigest()

@@ -141,6 +141,8 @@ def main() -> None:
     """
     verbose = bool({"-v", "--verbose"} & set(sys.argv))
     _silence_libraries()
+    # otherwise Dask imports distributed, to look for a client
+    os.environ.setdefault("DASK_SCHEDULER", "threads")
     warnings.formatwarning = _one_line
     if not verbose and not sys.warnoptions:
         # those of libraries, which name lines of their code

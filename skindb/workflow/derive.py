@@ -22,12 +22,13 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import xarray as xr
 
-from skindb.files import plain
+from skindb.cache import cached_arrays
+from skindb.files import ROOT, package_digest, plain
 from skindb.store import STUDY, SUMMARY, Database, Lease, Record
 
-ROOT = Path(__file__).parents[1]
 PACKAGE = "skindb"
 # The store returns what was committed, and the version of the schema, which every
 # version records, stands for the table of variables
@@ -79,6 +80,17 @@ def _symbol(function: Callable[..., Any]) -> Symbol:
 
 @cache
 def _digest_of(root: Path, starts: tuple[Symbol, ...]) -> str:
+    """From the cache on disk while no file of the package changes, as parsing takes a second."""
+    stored = cached_arrays(
+        f"code-{starts[0][1]}",
+        (starts, package_digest(root)),
+        sources=(__name__,),
+        make=lambda: {"digest": np.array([_parsed_digest(root, starts)])},
+    )
+    return str(stored["digest"][0])
+
+
+def _parsed_digest(root: Path, starts: tuple[Symbol, ...]) -> str:
     digest = hashlib.sha256()
     for module, name in sorted(_reached(root, starts)):
         digest.update(f"{module}:{name}\n".encode())

@@ -7,7 +7,6 @@ The scheduler of a cluster imports this module, so it imports nothing large.
 from __future__ import annotations
 
 import asyncio
-import hashlib
 import json
 import os
 import signal
@@ -27,7 +26,7 @@ from concurrent.futures import (
 from concurrent.futures import Executor as Pool
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from pickle import PicklingError
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
@@ -40,7 +39,7 @@ from loky.process_executor import BrokenProcessPool
 from skindb import __version__
 from skindb.elementwise import thread_count
 from skindb.errors import Fault, InputError, input_error, require, system_fault
-from skindb.files import make_private, private_file
+from skindb.files import make_private, package_digest, private_file
 from skindb.threads import one_blas_thread
 from skindb.workflow.audit import as_part
 
@@ -56,7 +55,6 @@ PARENT_SECONDS = 0.5
 # bytes that a worker may keep between takes: tables are 200 MB, and loky replaces
 # workers that keep 300, with a warning
 LOKY = {"LOKY_MAX_MEMORY_LEAK_SIZE": str(1 << 30)}
-ROOT = Path(__file__).parents[1]
 CONNECT_SECONDS = 10  # until a scheduler that does not answer counts as unreachable
 # that a take waits for the one its worker is busy with, before it asks for another
 # worker
@@ -271,18 +269,6 @@ def _end_with(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(PARENT_SECONDS)
     os._exit(1)
-
-
-@cache
-def package_digest() -> str:
-    """Digest of all source files of skindb, byte by byte: whether two processes run the
-    same program.
-    """
-    digest = hashlib.sha256()
-    for file in sorted([*ROOT.rglob("*.py"), *ROOT.rglob("*.json")]):
-        name = file.relative_to(ROOT).as_posix()
-        digest.update(name.encode() + b"\0" + file.read_bytes() + b"\0")
-    return digest.hexdigest()
 
 
 @dataclass(frozen=True)

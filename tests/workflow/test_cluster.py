@@ -19,8 +19,9 @@ import pytest
 from waiting import wait_until
 
 from skindb.errors import InputError
+from skindb.files import package_digest
 from skindb.workflow import connected, map_takes
-from skindb.workflow.takes import Expected, package_digest, shared_token
+from skindb.workflow.takes import Expected, shared_token
 
 pytestmark = pytest.mark.slow
 

@@ -6,22 +6,20 @@ from __future__ import annotations
 
 import shutil
 from functools import partial
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import xarray as xr
 
-import skindb
+from skindb.files import package_digest
 from skindb.fit.model import second_pass
 from skindb.schema import dataset
 from skindb.store import Database
-from skindb.workflow import cohorts, edits, fit, takes
+from skindb.workflow import cohorts, edits, fit
 from skindb.workflow import derive as module
 from skindb.workflow.cohorts import summary_parameters
 from skindb.workflow.derive import Derivation, code_digest, derive
-from skindb.workflow.takes import package_digest
 
 FILES = {
     "__init__.py": '''
@@ -183,16 +181,11 @@ def test_code_digest__covers_a_fit_are_science_with_its_kernels():
     assert top.isdisjoint({"analysis", "render", "store", "workflow", "cli", "export"})
 
 
-def test_package_digest__changes_with_every_byte(package, monkeypatch):
-    monkeypatch.setattr(takes, "ROOT", package)
-    package_digest.cache_clear()
-    before = package_digest()
+def test_package_digest__changes_with_every_byte(package):
+    before = package_digest(package)
     (package / "science/model.py").write_text(FILES["science/model.py"] + "#")
     package_digest.cache_clear()
-    assert package_digest() != before
-    monkeypatch.undo()
-    package_digest.cache_clear()
-    assert Path(skindb.__file__).parent == module.ROOT
+    assert package_digest(package) != before
 
 
 def _version(calls, **attrs):
