@@ -7,7 +7,7 @@ different delays.
 Captures and models have realistic records (about 10 kB of provenance) and no data. The
 bucket is a copy of the folder in an S3 server on this machine, in its own process; the
 delay is added to every request. Every query runs in a new process, whose start and
-imports are not timed: without the cache `catalogue.json` (cold), with it (later), and
+imports are not timed: without the cache `catalogue/` (cold), with it (later), and
 after one take was fitted again (refitted). "CPU" is the CPU time of the process.
 Medians are printed.
 """
@@ -33,9 +33,9 @@ from faulty_proxy import faulty_proxy
 import skindb
 from skindb.store import Database
 from skindb.store.bucket import Bucket
+from skindb.store.entries import CATALOGUE
 
 QUERY = "condition == 'lotion' and age > 40 and fit_k == 4 and status_fitted > 0.5"
-CATALOGUE = "catalogue.json"
 QUERIES: dict[str, Callable[[Database], Any]] = {
     "takes(where)": lambda db: db.takes(where=QUERY),
     "table": lambda db: db.table(),
@@ -95,7 +95,9 @@ def copied(folder: Path, url: str) -> None:
     """Put every file of a database into a bucket."""
     place = Bucket(url)
     names = [
-        path for path in folder.rglob("*") if path.is_file() and path.name != CATALOGUE
+        path
+        for path in folder.rglob("*")
+        if path.is_file() and path.parent.name != CATALOGUE
     ]
     with ThreadPoolExecutor(8) as pool:
         list(

@@ -162,7 +162,7 @@ def main(
     root = work / f"population{takes}"
     grow(skindb.open(db), take, root, takes)
     place = skindb.open(root).place
-    for cache in ("catalogue.json", "gathered"):
+    for cache in ("catalogue", "gathered"):
         place.remove(cache)
     for name in STEPS:
         run = [

@@ -121,7 +121,7 @@ def _files(folder):
     files = [
         path
         for path in folder.rglob("*")
-        if path.is_file() and path.name != "catalogue.json"
+        if path.is_file() and path.parent.name != "catalogue"
     ]
     return {str(path): path.read_bytes() for path in files}
 

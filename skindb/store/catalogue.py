@@ -10,8 +10,9 @@ from skindb.errors import InputError, SkindbWarning
 from skindb.schema.cohort import column, few_names, imitates_column, take_coords
 from skindb.schema.consent import CONSENT, consent_scope
 from skindb.store.condition import evaluate, is_missing
+from skindb.store.entries import CACHED_KINDS
 from skindb.store.place import CALIBRATION, RELEASE, STUDY, Located
-from skindb.store.snapshot import CACHED_KINDS, Lookup, RecordCache
+from skindb.store.snapshot import Lookup, RecordCache
 from skindb.store.stale import DERIVED, Staleness
 
 # kinds whose generation and date the catalogue shows

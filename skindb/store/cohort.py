@@ -30,8 +30,10 @@ from skindb.store.gathered import (
 )
 from skindb.store.place import SUMMARY, Located
 from skindb.store.record import Record
-from skindb.store.snapshot import READER_THREADS, Lookup
+from skindb.store.snapshot import Lookup
 
+# takes that are read faster by themselves than from caches that hold many others
+FEW_TAKES = 32
 Layout = Literal["tables", "surfels", "maps"]
 GROUP: dict[str, str] = {"tables": "tables", "surfels": "sample", "maps": "maps"}
 SAMPLES = "reflectance_sample"
@@ -125,7 +127,7 @@ def cohort(
         _part(lookup, records[take], version, request, chosen)
         for take, version in stored.items()
     ]
-    if layout == "tables" and len(parts) > READER_THREADS:
+    if layout == "tables" and len(parts) > FEW_TAKES:
         addresses = [Address.of(lookup.place, version) for version in stored.values()]
         sources = table_sources(addresses)
         parts = [

@@ -24,13 +24,14 @@ from skindb.store.catalogue import (
     describe_versions,
     matching,
 )
-from skindb.store.cohort import CohortRequest, Layout, cohort
+from skindb.store.cohort import FEW_TAKES, CohortRequest, Layout, cohort
 from skindb.store.decisions import (
     commit_release,
     consent_history,
     create_release,
     record_consent,
 )
+from skindb.store.entries import CACHED_KINDS
 from skindb.store.erasure import (
     Erasure,
     Holdings,
@@ -53,8 +54,6 @@ from skindb.store.markers import (
 from skindb.store.place import subject_of
 from skindb.store.record import Record
 from skindb.store.snapshot import (
-    CACHED_KINDS,
-    READER_THREADS,
     Lookup,
     RecordCache,
     Snapshot,
@@ -384,7 +383,7 @@ class Database:
         # registrations are not cached, because each names every take; few takes are
         # read faster without the records of all others
         is_cached = kind == "model" and layout != "maps"
-        is_cached &= takes is None or len(takes) > READER_THREADS
+        is_cached &= takes is None or len(takes) > FEW_TAKES
         lookup = Lookup(self, release, RecordCache(self.place) if is_cached else None)
         lookup.read_ahead(CACHED_KINDS)
         combined = cohort(

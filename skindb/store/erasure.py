@@ -18,6 +18,7 @@ from typing import TypeVar
 from skindb.errors import InputError, input_error
 from skindb.schema.consent import CONSENT
 from skindb.store.decisions import commit_release
+from skindb.store.entries import catalogue_blocks_of
 from skindb.store.folder import remove_tree
 from skindb.store.gathered import blocks_of
 from skindb.store.lease import Lease
@@ -26,6 +27,7 @@ from skindb.store.markers import Markers, mark_withdrawn, note_withdrawals, read
 from skindb.store.place import (
     KINDS_OF_ONE_SUBJECT,
     KINDS_WITHOUT_SUBJECT,
+    READER_THREADS,
     RELEASE,
     STUDY,
     SUMMARY,
@@ -37,7 +39,6 @@ from skindb.store.place import (
     subject_of,
 )
 from skindb.store.record import Record, subjects_of
-from skindb.store.snapshot import CATALOGUE, cache_names
 from skindb.store.stage import read_names, remove_version
 from skindb.store.stale import (
     PINS,
@@ -61,7 +62,6 @@ SCRATCH_NAME = re.compile(rf"({TAKE})-[0-9a-f]{{16}}")
 ABANDONED_SCRATCH = ".gone"
 # start of the names of a version and of the files beside it
 STEM = re.compile(rf"({TIME_HEX})\.")
-READER_THREADS = 8
 Key = tuple[str, str, str]  # kind, take and seal of a version
 
 
@@ -139,7 +139,7 @@ def holdings_of(place: Place, markers: Markers) -> Holdings:
         ),
         scratch=tuple(_scratch(place, markers)),
         caches=(
-            *([CATALOGUE] if cache_names(place, markers.is_withdrawn) else []),
+            *catalogue_blocks_of(place, markers.is_withdrawn),
             *blocks_of(place, markers.is_withdrawn),
         ),
     )

@@ -13,7 +13,7 @@ from skindb.errors import InputError, input_error
 from skindb.limits import RESUMABLE_SECONDS
 from skindb.schema.consent import CONSENT
 from skindb.store.erasure import SCRATCH_NAME, erase_withdrawn, holdings_of
-from skindb.store.gathered import GATHERED
+from skindb.store.gathered import GATHERED, outdated_blocks
 from skindb.store.lease import NUMBER, Lease, abandoned_holder, holder_of, storage_time
 from skindb.store.log import Log, committed_logs, takes_below
 from skindb.store.markers import Markers, read_markers
@@ -73,7 +73,7 @@ def find_garbage(place: Place, generations: int | None = None) -> list[Garbage]:
         *_of_withdrawn_subjects(place, markers),
         *_temporary_files(place, now),
         *_scratch_folders(place, now),
-        *_old_blocks(place, now),
+        *_outdated_blocks(place),
     ]
     unrecorded = partial(_unrecorded, tombstone_names=tombstones(place))
     for key, of_take in (("data", unrecorded), ("leases", _abandoned_leases)):
@@ -281,13 +281,13 @@ def _temporary_files(place: Place, now: Clock) -> Iterator[Garbage]:
             yield Garbage(key, "a temporary file of a killed writer", size, reason)
 
 
-def _old_blocks(place: Place, now: Clock) -> Iterator[Garbage]:
-    """Gathered tables, which may be outdated and are gathered again."""
-    sizes = place.sizes(GATHERED) if place.file_type(GATHERED) == "folder" else {}
-    for name, size in sizes.items():
-        key = f"{GATHERED}/{name}"
-        if size >= 0 and not _recent_reason(place, [key], now, RESUMABLE_SECONDS):
-            yield Garbage(key, "tables that studies have gathered", size)
+def _outdated_blocks(place: Place) -> Iterator[Garbage]:
+    """Gathered tables of versions that were replaced."""
+    outdated = outdated_blocks(place)
+    sizes = place.sizes(GATHERED) if outdated else {}
+    for key in outdated:
+        size = sizes.get(key.removeprefix(f"{GATHERED}/"), 0)
+        yield Garbage(key, "tables that studies gathered from earlier versions", size)
 
 
 def _scratch_folders(place: Place, now: Clock) -> Iterator[Garbage]:

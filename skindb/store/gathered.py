@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -23,7 +24,8 @@ from skindb.errors import InputError, input_error, require
 from skindb.schema.cohort import TAKE, Held, combine
 from skindb.schema.variables import VARIABLES
 from skindb.store.bucket import place_at
-from skindb.store.log import RESTORE
+from skindb.store.entries import block_keys
+from skindb.store.log import RESTORE, committed_logs
 from skindb.store.markers import read_markers
 from skindb.store.place import Place, subject_of
 from skindb.store.record import AS_RECORDED, Record, intact_or_none
@@ -33,6 +35,7 @@ from skindb.store.stage import describe, read_tables
 GATHERED = "gathered"
 BLOCK_NAME = r"[0-9a-f]{64}\.npz"
 GATHERED_TAKES = 256  # in a block
+SEAL = "seal"  # of the version of each take in a block
 DIGEST_BYTES = 32  # before the content of a block
 # cached by a process; the tables of a take have some 20 kB, blocks 3 kB for each take
 MAX_OPEN_TABLES = 2048
@@ -111,18 +114,29 @@ def table_sources(addresses: Sequence[Address]) -> list[StoredTables]:
 
 def blocks_of(place: Place, is_named: Callable[[str], bool]) -> list[str]:
     """Blocks that may hold the tables of a subject for whom `is_named` is true."""
-    is_folder = place.file_type(GATHERED) == "folder"
-    keys = [f"{GATHERED}/{name}" for name in place.children(GATHERED) if is_folder]
+    return _blocks_with(place, TAKE, lambda take: is_named(subject_of(take)))
+
+
+def outdated_blocks(place: Place) -> list[str]:
+    """Blocks with tables of a version that is not the newest of its kind and take."""
+    if not block_keys(place, GATHERED):
+        return []
+    newest = {log.head().get(SEAL) for log in committed_logs(place)}
+    blocks = _blocks_with(place, SEAL, lambda seal: seal not in newest)
+    return [key for key in blocks if re.fullmatch(rf"{GATHERED}/{BLOCK_NAME}", key)]
+
+
+def _blocks_with(
+    place: Place, label: str, is_chosen: Callable[[str], bool]
+) -> list[str]:
+    """Blocks with such a label of a take, and those that cannot be read."""
+    keys = block_keys(place, GATHERED)
     blocks = {key: intact_or_none(partial(_stored, place, key)) for key in keys}
     return [
         key
         for key, block in blocks.items()
-        if block is None or any(is_named(subject_of(take)) for take in _takes(block))
+        if block is None or any(map(is_chosen, block[label].values.tolist()))
     ]
-
-
-def _takes(block: xr.Dataset) -> list[str]:
-    return [str(take) for take in block[TAKE].values]
 
 
 @lru_cache(MAX_OPEN_BLOCKS)
@@ -133,7 +147,9 @@ def _opened(block: Block) -> xr.Dataset:
         return stored
     markers = read_markers(place)
     # not from memory, which may hold tables of a subject who is withdrawn
-    parts = [Held.part(one.take, {}, _read(one)) for one in block.addresses]
+    parts = [
+        Held.part(one.take, {SEAL: one.seal}, _read(one)) for one in block.addresses
+    ]
     gathered = combine(parts).compute(scheduler="synchronous")
     # for example a read-only folder: the next study reads the versions again
     with suppress(OSError, InputError):
@@ -167,7 +183,10 @@ def _stored(place: Place, key: str) -> xr.Dataset:
         raise ValueError("content that does not match its digest")
     with np.load(io.BytesIO(content[DIGEST_BYTES:]), allow_pickle=False) as arrays:
         values = {name: arrays[name] for name in arrays.files}
-    coords = {name: values.pop(name) for name in [*values] if name not in VARIABLES}
+    coords: dict[str, Any] = {
+        name: values.pop(name) for name in [*values] if name not in VARIABLES
+    }
+    coords[SEAL] = (TAKE, coords[SEAL])
     dims = {name: (TAKE, *VARIABLES[name].dims) for name in values}
     return xr.Dataset({name: (dims[name], values[name]) for name in values}, coords)
 

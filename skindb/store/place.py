@@ -38,6 +38,8 @@ TRANSIENT = ("first",)
 LEASE_KINDS = {"first": "model"}
 VERSION = rf"data/{KIND}/{TAKE}/{TIME_HEX}\.zarr"
 Guard = Callable[[], None]  # raises if a file must not be written any more
+# that read small files; a bucket takes some 20 ms per file, whatever its size
+READER_THREADS = 32
 BLOCK_BYTES = 1 << 20  # of a file, the smallest part that is compared with a digest
 
 

@@ -1,30 +1,36 @@
 """Takes and records of a database, or of one of its releases, each looked up only once; and
-a cache of the parts of records that the catalogue needs, so that a query need not read
-all of them.
+a cache of records, so that a query need not read all of them.
 
-The cache, `catalogue.json`, may be missing or outdated, like the heads. A cached record
-is used as long as a listing shows the same file of the record and, for the newest
-record, the same head. All other listed records are read and checked again.
+A cached record is used as long as a listing shows the same file of the record and, for
+the newest record, the same head. All other listed records are read and checked again.
 """
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Hashable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from skindb.errors import Fault, InputError, input_error
 from skindb.schema.consent import CONSENT, consent_scope
+from skindb.store.entries import (
+    Entry,
+    Key,
+    blocks_to_merge,
+    key_of,
+    read_blocks,
+    trimmed_record,
+    write_blocks,
+)
 from skindb.store.log import GENERATION, Log
 from skindb.store.markers import Markers, WithdrawnError, read_markers
 from skindb.store.place import (
     KIND,
     KINDS_WITHOUT_SUBJECT,
+    READER_THREADS,
     RELEASE,
     TAKE,
     TRANSIENT,
@@ -34,50 +40,12 @@ from skindb.store.place import (
     require_text,
     subject_of,
 )
-from skindb.store.record import Record, intact_or_none, sealed, sealed_object
+from skindb.store.record import Record, intact_or_none
 
 # kinds of the versions that a release names for each take
 PINNED = ("capture", "model", "registration")
 # (kind, take) -> reference to the version in the provenance
 Pins = Mapping[tuple[str, str], Mapping[str, Any]]
-CATALOGUE = "catalogue.json"
-CACHE_FORMAT = 4
-# threads that read records; a bucket takes some 20 ms per record, whatever its size
-READER_THREADS = 32
-# parts of a provenance that the catalogue shows or uses
-CACHED_PARTS = (
-    "schema_version",
-    "subject",
-    "condition",
-    "session",
-    "traits",
-    "parameters",
-    "dictionary",
-    "dictionary_digest",
-    "even_reflection",
-    "even_reflection_error",
-    "summary_parameters",
-    "status",
-    "consent_scope",
-)
-# not registrations, which name every take: those of 1,000 takes have a million inputs
-KINDS_WITH_INPUTS = ("model",)
-# kinds whose cached records contain all that `Staleness` needs
-CACHED_KINDS = ("capture", *KINDS_WITH_INPUTS, CONSENT)
-# groups that cohorts need the layout of
-CACHED_GROUPS = {"capture": ("dome", "samples"), "model": ("tables", "sample")}
-# cached fields of a record
-CACHED_FIELDS = (
-    "kind",
-    "take",
-    "generation",
-    "path",
-    "created",
-    "bytes",
-    "admissions",
-    "seal",
-)
-Key = tuple[str, str, int]
 
 
 class Snapshot:
@@ -342,17 +310,6 @@ def pinned_record(records: Records, pins: Pins, kind: str, take: str) -> Record:
     return record
 
 
-@dataclass(frozen=True)
-class Entry:
-    """A record that was read and checked, with the identities of its files."""
-
-    record: Record
-    file: str  # identity of the file of the record
-    # identity of the head when the record was the newest; empty without a head, None if
-    # not read
-    head: str | None
-
-
 class RecordCache:
     """The records of a database as `Lookup` needs them; only records that are not in the
     cache are read.
@@ -368,16 +325,31 @@ class RecordCache:
         with ThreadPoolExecutor(4) as pool:
             listed = pool.submit(list_records, place)
             heads = pool.submit(_list_heads, place)
-            stored = pool.submit(_load_entries, place)
+            blocks = pool.submit(read_blocks, place)
             markers = pool.submit(read_markers, place)
         self._files = listed.result()
         self._heads = heads.result()
         self._markers = markers.result()
         self.snapshot = Snapshot(place, self._markers)
-        entries = stored.result() or {}
-        self._entries = _unchanged_entries(entries, self._files)
-        self._changed = len(self._entries) != len(entries)
+        self._entries: dict[Key, Entry] = {}
+        # key of each block -> its entries that are still valid; none if it is damaged
+        self._blocks = {
+            key: self._add_entries(entries or ())
+            for key, entries in blocks.result().items()
+        }
+        self._new: set[Key] = set()  # entries that no block holds
         self._generations = _generations(self._files)
+
+    def _add_entries(self, entries: Iterable[Entry]) -> list[Key]:
+        """Add the entries of a block whose files have not changed."""
+        added = []
+        for entry in entries:
+            key = key_of(entry.record)
+            if self._files.get(key) == entry.file:
+                added.append(key)
+                if key not in self._entries or entry.head == self._head_text(*key[:2]):
+                    self._entries[key] = entry
+        return added
 
     def kinds(self) -> list[str]:
         """Kinds of the versions of all takes, without the transient kinds."""
@@ -445,25 +417,29 @@ class RecordCache:
             pool.shutdown(cancel_futures=True)
 
     def save(self) -> None:
-        """Write the cache for the next query if possible, without records that were
-        removed meanwhile.
+        """Write what was read to the cache for the next query if possible, without
+        records that were removed meanwhile.
         """
-        if not self._changed:
+        if not self._new:
             return
-        entries = _unchanged_entries(self._entries, list_records(self.place))
-        rows = [
+        merged = blocks_to_merge(self._blocks, len(self._new))
+        keys = self._new.union(*(self._blocks[block] for block in merged))
+        listed = list_records(self.place)
+        entries = [
             entry
-            for _, entry in sorted(entries.items())
+            for entry in map(self._entries.__getitem__, keys)
             if self._markers.admits(entry.record)
+            and listed.get(key_of(entry.record)) == entry.file
         ]
-        # most takes have the same groups, and those registered together the same names
-        shared: dict[str, int] = {}
-        records = [_row(entry, shared) for entry in rows]
-        body = {"format": CACHE_FORMAT, "shared": [*shared], "records": records}
         # for example a read-only folder: the next query reads the log again
         with suppress(OSError, InputError):
-            guard = partial(require_same_markers, self.place, self._markers, CATALOGUE)
-            self.place.replace(CATALOGUE, sealed(body), guard=guard)
+            guard = partial(require_same_markers, self.place, self._markers)
+            written = write_blocks(self.place, entries, guard)
+            for block in {*merged} - written.keys():
+                self.place.remove(block)
+                del self._blocks[block]
+            self._blocks |= written
+            self._new = set()
 
     def _entry(self, kind: str, take: str, generation: int | None) -> Entry | None:
         """Cached entry of a version; None if its files have changed."""
@@ -471,10 +447,12 @@ class RecordCache:
         number = generation if generation is not None or not listed else listed[-1]
         entry = None if number is None else self._entries.get((kind, take, number))
         is_checked = generation is not None or (
-            entry is not None
-            and entry.head == identity_text(self._heads.get((kind, take), ()))
+            entry is not None and entry.head == self._head_text(kind, take)
         )
         return entry if is_checked else None
+
+    def _head_text(self, kind: str, take: str) -> str:
+        return identity_text(self._heads.get((kind, take), ()))
 
     def _read(self, kind: str, take: str, generation: int | None) -> Record:
         """A record from the log, with the checks of `Log.read`."""
@@ -496,14 +474,15 @@ class RecordCache:
         if not self._markers.admits(record):
             # raises the reason
             return self.snapshot.record(kind, take, generation)
-        record, key = _trimmed_record(record), (kind, take, record.generation)
+        record = trimmed_record(record)
+        key = key_of(record)
         if key in self._files:
             self._entries[key] = Entry(
                 record,
                 self._files[key],
-                identity_text(head) if generation is None else None,
+                self._head_text(kind, take) if generation is None else None,
             )
-            self._changed = True
+            self._new.add(key)
         return record
 
 
@@ -521,18 +500,6 @@ def require_same_markers(place: Place, markers: Markers, key: str) -> None:
                 "run the command again",
             )
         )
-
-
-def cache_names(place: Place, is_named: Callable[[str], bool]) -> bool:
-    """Whether the cache may contain a record of a subject for whom `is_named` is true."""
-    if not place.file_type(CATALOGUE):
-        return False
-    entries = _load_entries(place)
-    return entries is None or any(
-        is_named(subject)
-        for entry in entries.values()
-        for subject in entry.record.subjects
-    )
 
 
 def _generations(files: Iterable[Key]) -> dict[tuple[str, str], list[int]]:
@@ -553,61 +520,3 @@ def _list_heads(place: Place) -> dict[tuple[str, str], tuple[Hashable, ...]]:
         if name.endswith(".json")
     }
     return {(kind, take): identities[name] for name, (kind, _, take) in parts.items()}
-
-
-def _unchanged_entries(
-    entries: Mapping[Key, Entry], files: Mapping[Key, str]
-) -> dict[Key, Entry]:
-    return {
-        key: entry for key, entry in entries.items() if files.get(key) == entry.file
-    }
-
-
-def _load_entries(place: Place) -> dict[Key, Entry] | None:
-    """Entries of the cache; None if it is missing, damaged or of another format."""
-
-    def read() -> dict[Key, Entry] | None:
-        body = sealed_object(place.read_small(CATALOGUE))
-        if body["format"] != CACHE_FORMAT:
-            return None
-        shared = [json.loads(text) for text in body["shared"]]
-        entries = {}
-        for row in body["records"]:
-            names = tuple(shared[row["names"]])
-            contents = shared[row["contents"]]
-            record = Record(**row["record"], names=names, contents=contents)
-            key = (record.kind, record.take, record.generation)
-            entries[key] = Entry(record, str(row["file"]), row["head"])
-        return entries
-
-    return intact_or_none(read)
-
-
-def _trimmed_record(record: Record) -> Record:
-    parts = (
-        (*CACHED_PARTS, "inputs") if record.kind in KINDS_WITH_INPUTS else CACHED_PARTS
-    )
-    provenance = {
-        name: record.provenance[name] for name in parts if name in record.provenance
-    }
-    fields = {name: getattr(record, name) for name in CACHED_FIELDS}
-    contents = {
-        name: record.contents[name]
-        for name in CACHED_GROUPS.get(record.kind, ())
-        if name in record.contents
-    }
-    return Record(
-        **fields, names=record.names, contents=contents, provenance=provenance
-    )
-
-
-def _row(entry: Entry, shared: dict[str, int]) -> dict[str, Any]:
-    """A row of the cache; values of `names` and `contents` are added to `shared`."""
-    record = {
-        name: getattr(entry.record, name) for name in (*CACHED_FIELDS, "provenance")
-    }
-    parts = {
-        name: shared.setdefault(json.dumps(getattr(entry.record, name)), len(shared))
-        for name in ("names", "contents")
-    }
-    return {"record": record, "file": entry.file, "head": entry.head, **parts}

@@ -19,6 +19,7 @@ from typing import Any, Literal
 
 from skindb.errors import Fault, InputError, SkindbWarning
 from skindb.schema.consent import CONSENT
+from skindb.store.entries import CACHED_KINDS
 from skindb.store.log import Log
 from skindb.store.markers import WithdrawnError
 from skindb.store.place import (
@@ -39,7 +40,7 @@ from skindb.store.record import (
     sealed,
     sealed_object,
 )
-from skindb.store.snapshot import CACHED_KINDS, Records, Snapshot, consent_of
+from skindb.store.snapshot import Records, Snapshot, consent_of
 
 Why = Literal["withdrawn", "unreadable", "not covered", "superseded"]
 REASONS: dict[Why, str] = {

@@ -10,6 +10,7 @@ import xarray as xr
 
 from skindb.errors import Fault, InputError
 from skindb.store.audit import BLOCK_NAME, ENTRY_NAME, read_audit
+from skindb.store.entries import CATALOGUE, CATALOGUE_BLOCK
 from skindb.store.erasure import holdings_of
 from skindb.store.gathered import BLOCK_NAME as GATHERED_NAME
 from skindb.store.gathered import GATHERED
@@ -54,6 +55,7 @@ LAYOUT = {
     AUDIT: (BLOCK_NAME, ENTRY_NAME),
     REQUESTS: (REQUEST_NAME,),
     GATHERED: (GATHERED_NAME,),
+    CATALOGUE: (CATALOGUE_BLOCK,),
 }
 THREADS = 8  # that read files; a server answers many requests in parallel
 FILE_BESIDE = re.compile(r"\.(manifest|tables)\.json")

@@ -34,7 +34,7 @@ from skindb.errors import InputError
 from skindb.store import Database, archive, backup_states, restore
 
 BROKEN = "broken promise"
-CACHES = ("catalogue.json", "leases/", "staging/", "withdrawn/")
+CACHES = ("catalogue/", "leases/", "staging/", "withdrawn/")
 REFUSAL = "a restore that is not complete"
 STEPS = ("backup", "restore")
 

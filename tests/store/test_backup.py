@@ -41,7 +41,7 @@ NAMES = [
     "__proto__",
     "CON",
 ]
-CACHES = ("catalogue.json", "leases/", "staging/", "heads/", "withdrawn/")
+CACHES = ("catalogue/", "leases/", "staging/", "heads/", "withdrawn/")
 
 
 def _commit(url, kind, take, value=1.0, names=(), **about):
@@ -467,7 +467,7 @@ def test_restore__refuses_names_that_lead_elsewhere(db, dest, tmp_path):
         "../evil",
         "log/../../evil",
         "/tmp/evil",
-        "catalogue.json",
+        "catalogue/x.json",
         "audit/../x",
         "log/model/../00000001.json",
     ):

@@ -4,8 +4,6 @@ holds nothing of withdrawn subjects.
 
 from __future__ import annotations
 
-import os
-import time
 from unittest import mock
 
 import numpy as np
@@ -37,7 +35,7 @@ def db(tmp_path, monkeypatch):
 
 
 def _database(url, monkeypatch):
-    monkeypatch.setattr(cohort, "READER_THREADS", 1)
+    monkeypatch.setattr(cohort, "FEW_TAKES", 1)
     monkeypatch.setattr(gathered, "GATHERED_TAKES", 2)
     db = Database(url)
     for number, subject in enumerate(REGIONS):
@@ -53,7 +51,7 @@ def _values(db):
 
 
 def _without_blocks(db):
-    with mock.patch.object(cohort, "READER_THREADS", 100):
+    with mock.patch.object(cohort, "FEW_TAKES", 100):
         return _values(db)
 
 
@@ -155,13 +153,18 @@ def test_erase__tables_in_memory_make_no_block(db):
     assert db.verify() == []
 
 
-def test_clean__removes_blocks_after_a_day(db):
+def test_clean__removes_the_blocks_of_earlier_versions(db):
     _values(db)
-    old, *rest = _blocks(db)
-    os.utime(old, times=(time.time() - 2 * 86400,) * 2)
-    assert [item.key for item in db.garbage()] == [f"gathered/{old.name}"]
+    first = _blocks(db)
+    _commit(db, "S3", 9.0)
+    _values(db)
+    [old] = [
+        f"gathered/{file.name}" for file in first if b"S\0\0\0003" in file.read_bytes()
+    ]
+    assert [item.key for item in db.garbage()] == [old]
     db.clean()
-    assert _blocks(db) == rest
+    assert len(_blocks(db)) == 3
+    assert db.root / old not in _blocks(db)
 
 
 @pytest.mark.slow

@@ -1,0 +1,204 @@
+"""Blocks of the cache of records, which hold the parts of records that queries need.
+
+A block, `catalogue/<digest>.json`, is named after its content and never changes. A query
+that had to read records writes them in a new block together with the blocks that are
+not much larger, which it then removes: a row is written again few times, and there are
+few blocks. No lock is needed, as by SQLite on a folder that machines share: an entry
+counts only while the files that it was read from are the same.
+"""
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from skindb.schema.consent import CONSENT
+from skindb.store.place import READER_THREADS, Place
+from skindb.store.record import Record, intact_or_none
+
+CATALOGUE = "catalogue"
+CATALOGUE_BLOCK = r"[0-9a-f]{64}\.json"
+BLOCK_FORMAT = 5
+# a withdrawal removes the blocks with its subject, whose other rows are read again
+MAX_BLOCK_ROWS = 2048
+# a block of at most this many times the new rows is merged with them
+MERGE_RATIO = 4
+# to read all blocks while other queries merge some of them
+MAX_LISTINGS = 3
+# parts of a provenance that are equal in many records
+SHARED_PARTS = (
+    "schema_version",
+    "parameters",
+    "dictionary",
+    "dictionary_digest",
+    "summary_parameters",
+    "consent_scope",
+)
+# parts that the catalogue shows or uses
+CACHED_PARTS = (
+    *SHARED_PARTS,
+    "subject",
+    "condition",
+    "session",
+    "traits",
+    "even_reflection",
+    "even_reflection_error",
+    "status",
+)
+# not registrations, which name every take: those of 1,000 takes have a million inputs
+KINDS_WITH_INPUTS = ("model",)
+# kinds whose cached records contain all that `Staleness` needs
+CACHED_KINDS = ("capture", *KINDS_WITH_INPUTS, CONSENT)
+# groups that cohorts need the layout of
+CACHED_GROUPS = {"capture": ("dome", "samples"), "model": ("tables", "sample")}
+# cached fields of a record
+CACHED_FIELDS = (
+    "kind",
+    "take",
+    "generation",
+    "path",
+    "created",
+    "bytes",
+    "admissions",
+    "seal",
+)
+Key = tuple[str, str, int]  # kind, take and generation of a record
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A record that was read and checked, with the identities of its files."""
+
+    record: Record
+    file: str  # identity of the file of the record
+    # identity of the head when the record was the newest; empty without a head, None if
+    # not read
+    head: str | None
+
+
+def key_of(record: Record) -> Key:
+    """Key of an entry."""
+    return record.kind, record.take, record.generation
+
+
+def trimmed_record(record: Record) -> Record:
+    """The record with the parts that are cached."""
+    inputs = ("inputs",) if record.kind in KINDS_WITH_INPUTS else ()
+    groups = CACHED_GROUPS.get(record.kind, ())
+    return Record(
+        **{name: getattr(record, name) for name in CACHED_FIELDS},
+        names=record.names,
+        contents=_chosen(record.contents, groups),
+        provenance=_chosen(record.provenance, (*CACHED_PARTS, *inputs)),
+    )
+
+
+def block_keys(place: Place, folder: str) -> list[str]:
+    """Keys of the blocks of a cache; none if its folder is damaged."""
+    names = intact_or_none(partial(place.children, folder)) or []
+    return [f"{folder}/{name}" for name in names]
+
+
+def read_blocks(place: Place) -> dict[str, list[Entry] | None]:
+    """Key of every block -> its entries; None if it is damaged."""
+    blocks: dict[str, list[Entry] | None] = {}
+    for _ in range(MAX_LISTINGS):
+        keys = block_keys(place, CATALOGUE)
+        with ThreadPoolExecutor(READER_THREADS) as pool:
+            entries = pool.map(partial(_read_block, place), keys)
+            blocks = dict(zip(keys, entries, strict=True))
+        if None not in blocks.values():
+            break
+    return blocks
+
+
+def catalogue_blocks_of(place: Place, is_named: Callable[[str], bool]) -> list[str]:
+    """Blocks that may name a subject for whom `is_named` is true."""
+    return [
+        key
+        for key, entries in read_blocks(place).items()
+        if entries is None
+        or any(is_named(name) for entry in entries for name in entry.record.subjects)
+    ]
+
+
+def blocks_to_merge(blocks: Mapping[str, Sequence[Key]], rows: int) -> list[str]:
+    """Blocks to write again with this number of new rows, the smallest first."""
+    merged = []
+    for key in sorted(blocks, key=lambda key: len(blocks[key])):
+        size = len(blocks[key])
+        if size > min(MERGE_RATIO * rows, MAX_BLOCK_ROWS // 2):
+            break
+        merged.append(key)
+        rows += size
+    return merged
+
+
+def write_blocks(
+    place: Place, entries: Iterable[Entry], guard: Callable[[str], None]
+) -> dict[str, list[Key]]:
+    """Write blocks; returns the keys of their entries. The guard is called with the key
+    of each block, see `Place.replace`.
+    """
+    # takes together, so that few blocks name a subject
+    rows = sorted(entries, key=lambda entry: (entry.record.take, key_of(entry.record)))
+    count = math.ceil(len(rows) / MAX_BLOCK_ROWS)
+    written = {}
+    for number in range(count):
+        start = number * len(rows) // count
+        part = rows[start : (number + 1) * len(rows) // count]
+        content = _content(part)
+        key = f"{CATALOGUE}/{hashlib.sha256(content).hexdigest()}.json"
+        place.replace(key, content, guard=partial(guard, key))
+        written[key] = [key_of(entry.record) for entry in part]
+    return written
+
+
+def _chosen(values: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
+    return {name: values[name] for name in names if name in values}
+
+
+def _content(entries: Iterable[Entry]) -> bytes:
+    shared: dict[str, int] = {}
+
+    def index(value: Any) -> int:
+        return shared.setdefault(json.dumps(value), len(shared))
+
+    rows = []
+    for entry in entries:
+        record = entry.record
+        provenance = record.provenance
+        own = {n: value for n, value in provenance.items() if n not in SHARED_PARTS}
+        parts = (_chosen(provenance, SHARED_PARTS), record.names, record.contents)
+        fields = [getattr(record, name) for name in CACHED_FIELDS]
+        rows.append([fields, own, *map(index, parts), entry.file, entry.head])
+    values = [json.loads(text) for text in shared]
+    body = {"format": BLOCK_FORMAT, "shared": values, "rows": rows}
+    return json.dumps(body, separators=(",", ":")).encode()
+
+
+def _read_block(place: Place, key: str) -> list[Entry] | None:
+    def read() -> list[Entry] | None:
+        content = place.read_small(key)
+        if key != f"{CATALOGUE}/{hashlib.sha256(content).hexdigest()}.json":
+            return None
+        body = json.loads(content)
+        if body["format"] != BLOCK_FORMAT:
+            return None
+        shared = body["shared"]
+        entries = []
+        for fields, own, common, names, contents, file, head in body["rows"]:
+            record = Record(
+                **dict(zip(CACHED_FIELDS, fields, strict=True)),
+                provenance=shared[common] | own,
+                names=tuple(shared[names]),
+                contents=shared[contents],
+            )
+            entries.append(Entry(record, file, head))
+        return entries
+
+    return intact_or_none(read)
