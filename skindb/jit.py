@@ -258,6 +258,26 @@ def vector_half(_typing: Any, bits: Any) -> Any:
     return types.float32(bits), codegen
 
 
+@intrinsic
+def float_bits(_typing: Any, value: Any) -> Any:
+    """The bits of a float32 as int32."""
+
+    def codegen(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.IntType(32))
+
+    return types.int32(value), codegen
+
+
+@intrinsic
+def bits_float(_typing: Any, bits: Any) -> Any:
+    """The float32 with these bits."""
+
+    def codegen(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.FloatType())
+
+    return types.float32(bits), codegen
+
+
 @inline_fast_kernel
 def plain_blend(
     table: Matrix32,

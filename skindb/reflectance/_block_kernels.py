@@ -85,8 +85,9 @@ def _cube_roots(count: int, b: Lumitexel) -> None:
 def _problem(count: int, lift: Matrix, options: Options, b: Lumitexel) -> Problem:
     return Problem(
         b.rows,
-        b.target[:, :count],
+        b.target,
         b.weight,
+        count,
         lift,
         options.mode == PERCEPTUAL,
         options.floor,
@@ -151,7 +152,7 @@ def fit_block(block: Block, tables: Tables, options: Options, out: SurfaceFit) -
         if options.mode == PAPER:
             for r in range(count):
                 b.surface[r] = b.surface[r] ** 3
-        out.residual[s], out.residual_perceptual[s] = add_surface(count, b, work.root)
+        out.residual[s], out.residual_perceptual[s] = add_surface(count, b)
 
 
 @kernel
@@ -176,7 +177,7 @@ def _write_covariance(
         b.weight,
         options.mode == PERCEPTUAL,
         options.floor,
-        b.scattered[:, :count],
+        b.scattered,
         drift,
         out.parameters[s],
         OUTLIER_SPREAD if options.mode == PERCEPTUAL else 1.0,
@@ -239,7 +240,7 @@ def _write_held_error(
     count = write_rows(block.normal[s], tables.table, b)
     split_diffuse(block.diffuse[s], count, b)
     predict(b.rows, count, out.parameters[s], b.surface, work.single)
-    error = add_surface(count, b, work.root)
+    error = add_surface(count, b)
     out.held_error[s, kind - 1, 0], out.held_error[s, kind - 1, 1] = error
 
 
@@ -286,7 +287,7 @@ def judge_block(
         with_errors = out.covariance.shape[1] > 0
         if with_errors:
             _write_covariance(s, count, block, options, errors, out, b, work)
-        out.residual[s], out.residual_perceptual[s] = add_surface(count, b, work.root)
+        out.residual[s], out.residual_perceptual[s] = add_surface(count, b)
         if with_errors and errors.turn[s] > 0.0:
             _add_turned(s, count, block, tables, options, errors, out, b, work)
         for kind in range(1, 3):

@@ -23,7 +23,6 @@ from skindb.reflectance._lumitexel_kernels import (
     JudgedErrors,
     Lumitexel,
     Options,
-    RootMemory,
     add_scatter,
     add_surface,
     block_memory,
@@ -284,21 +283,20 @@ def _certificate(count: int, x: Vector, lobe: Lobe) -> tuple[float, float]:
 
 @kernel
 def _lobe_errors(
-    count: int, x: Vector, b: Lumitexel, lobe: Lobe, root: RootMemory
+    count: int, x: Vector, b: Lumitexel, lobe: Lobe
 ) -> tuple[float, float]:
     """Relative errors of the prediction of the chosen samples by x (2,)."""
     _write_values(count, x[ROUGHNESS], lobe)
     for r in range(count):
         for c in range(3):
             b.scattered[c, r] += x[STRENGTH] * lobe.value[r]
-    return relative_errors(b.scattered[:, :count], b.sample[:, :count], NO_FLOOR, root)
+    return relative_errors(b.scattered, b.sample, count, NO_FLOOR)
 
 
 @kernel
 def fit_ggx(block: Block, index: float, options: Options, out: SurfaceFit) -> None:
     """Fit every surfel of a block."""
     b = block_memory(block, 0)
-    root = root_memory(b.pairs.shape[0])
     lobe = lobe_memory(b.pairs.shape[0])
     for s in range(block.position.shape[0]):
         out.status[s] = prepare(s, block, options, b)
@@ -316,9 +314,7 @@ def fit_ggx(block: Block, index: float, options: Options, out: SurfaceFit) -> No
         out.iterations[s], converged = _solve(count, options, x, b, lobe)
         out.status[s] = fitted_status(converged, block.diffuse[s])
         out.kkt[s], out.condition[s] = _certificate(count, x, lobe)
-        out.residual[s], out.residual_perceptual[s] = _lobe_errors(
-            count, x, b, lobe, root
-        )
+        out.residual[s], out.residual_perceptual[s] = _lobe_errors(count, x, b, lobe)
 
 
 @kernel
@@ -426,14 +422,14 @@ def judge_ggx(
         if with_errors:
             relative_drift(d, errors.diffuse[s], drift)
             _write_covariance(count, drift, x, b, lobe, out.covariance[s])
-        out.residual[s], out.residual_perceptual[s] = add_surface(count, b, root)
+        out.residual[s], out.residual_perceptual[s] = add_surface(count, b)
         if with_errors and errors.turn[s] > 0.0:
             _add_turned(s, count, block, index, options, errors, out, b, lobe)
         for kind in range(1, 3):
             choose_kind(kind, errors.held, b)
             count = write_samples(b)
             write_lobe(d, count, index, b, lobe)
-            error = _lobe_errors(count, x, b, lobe, root)
+            error = _lobe_errors(count, x, b, lobe)
             out.held_error[s, kind - 1, 0], out.held_error[s, kind - 1, 1] = error
 
 

@@ -304,7 +304,7 @@ def _write_weights(
     weigh_outliers(count, o, b, m.root)
     for r in range(count):
         b.surface[r] += mean * m.table[r, DIFFUSE]
-    slopes(b.surface[:count], np.float32(o.floor), m.root, m.weight)
+    slopes(b.surface[:count], np.float32(o.floor), m.weight)
     for r in range(count):
         m.weight[r] *= b.weight[r]
 

@@ -9,7 +9,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skindb.jit import fast_kernel, kernel, median_of, unpack
+from skindb.jit import (
+    bits_float,
+    fast_kernel,
+    float_bits,
+    inline_fast_kernel,
+    kernel,
+    median_of,
+    unpack,
+)
 from skindb.reflectance._row_kernels import RowMemory, form_rows, row_memory
 from skindb.reflectance._shade_kernels import circular_reversal, transmittance
 from skindb.reflectance.model import Block, Noise
@@ -24,6 +32,7 @@ from skindb.types import (
     IntVector32,
     Matrix,
     Matrix32,
+    Real,
     Tensor32,
     Vector,
     Vector32,
@@ -93,10 +102,9 @@ class RootMemory(NamedTuple):
     total: Vector32  # sum of the targets over channels
     trial: Vector32  # residuals, or the prediction of a step
     mixed: Vector32  # values in cube-root space, or the prediction of a shorter step
-    square: Vector32  # squared values plus the squared noise floor
-    inverse: Vector32  # `square` to the power -1/3
-    square_bits: IntVector32  # the same memory as int32
-    inverse_bits: IntVector32
+    inverse: Vector32  # squared values plus the squared noise floor, to the power -1/3
+    size: Vector32  # of residuals
+    size_bits: IntVector32  # the same memory as int32
 
 
 class Lumitexel(NamedTuple):
@@ -128,9 +136,7 @@ class Lumitexel(NamedTuple):
 def root_memory(size: int) -> RootMemory:
     """Memory for up to `size` samples."""
     v = np.empty((5, size), np.float32)
-    return RootMemory(
-        v[0], v[1], v[2], v[3], v[4], v[3].view(np.int32), v[4].view(np.int32)
-    )
+    return RootMemory(v[0], v[1], v[2], v[3], v[4], v[4].view(np.int32))
 
 
 @kernel
@@ -171,39 +177,35 @@ def block_memory(block: Block, width: int) -> Lumitexel:
     return lumitexel_memory(lights, block.camera.shape[0], width, polarised)
 
 
-@fast_kernel
-def inverse_roots(n: int, root: RootMemory) -> None:
-    """Write s^(-1/3) to `root.inverse` for n positive numbers s in `root.square`.
+@inline_fast_kernel
+def inverse_root(s: Real) -> Real:
+    """s^(-1/3) of a positive number in single precision.
 
     A start from a third of the exponent bits, then two iterations of third order:
     accurate to rounding, and unlike `pow` it runs in vector registers.
     """
-    for i in range(n):
-        root.inverse_bits[i] = np.int32(MAGIC - np.float32(root.square_bits[i]) * THIRD)
-    for i in range(n):
-        x = root.inverse[i]
-        for _ in range(2):
-            d = ONE - root.square[i] * x * x * x
-            x += x * d * (THIRD + d * TWO_NINTHS)
-        root.inverse[i] = x
+    x = bits_float(np.int32(MAGIC - np.float32(float_bits(s)) * THIRD))
+    for _ in range(2):
+        d = ONE - s * x * x * x
+        x += x * d * (THIRD + d * TWO_NINTHS)
+    return x
 
 
 @fast_kernel
-def to_roots(y: Vector32, floor: np.float32, root: RootMemory) -> None:
-    """Write s = y^2 + floor^2 and q = s^(-1/3); y q is the value of y in cube-root space."""
+def to_roots(y: Vector32, floor: np.float32, q: Vector32) -> None:
+    """Write q = (y^2 + floor^2)^(-1/3); y q is the value of y in cube-root space."""
     for i in range(y.shape[0]):
-        root.square[i] = y[i] * y[i] + floor * floor
-    inverse_roots(y.shape[0], root)
+        q[i] = inverse_root(y[i] * y[i] + floor * floor)
 
 
 @fast_kernel
-def slopes(y: Vector32, floor: np.float32, root: RootMemory, out: Vector32) -> None:
+def slopes(y: Vector32, floor: np.float32, out: Vector32) -> None:
     """Write the squared slope of the cube root at y: the weight of a squared difference
     at y in cube-root space.
     """
-    to_roots(y, floor, root)
     for i in range(y.shape[0]):
-        square = root.inverse[i] * root.inverse[i]
+        inverse = inverse_root(y[i] * y[i] + floor * floor)
+        square = inverse * inverse
         slope = (y[i] * y[i] * THIRD + floor * floor) * square * square
         out[i] = slope * slope
 
@@ -511,14 +513,11 @@ def _root_residuals(
     for r in range(count):
         root.total[r] = (b.sample[0, r] + b.sample[1, r] + b.sample[2, r]) * THIRD
         body = b.scattered[0, r] + b.scattered[1, r] + b.scattered[2, r]
-        root.mixed[r] = body * THIRD + b.surface[r]
-        mean += root.total[r]
-    to_roots(root.total[:count], floor, root)
-    for r in range(count):
-        root.trial[r] = root.total[r] * root.inverse[r]
-    to_roots(root.mixed[:count], floor, root)
-    for r in range(count):
-        root.trial[r] -= root.mixed[r] * root.inverse[r]
+        mixed = body * THIRD + b.surface[r]
+        total = root.total[r]
+        mean += total
+        root.trial[r] = total * inverse_root(total * total + floor * floor)
+        root.trial[r] -= mixed * inverse_root(mixed * mixed + floor * floor)
     return np.float64(mean) / max(count, 1)
 
 
@@ -537,7 +536,7 @@ def outliers(
             b.lit[b.pairs[r, 0]] >= MIN_COSINE_OUTLIER
             and b.seen[b.pairs[r, 1]] >= MIN_COSINE_OUTLIER
         )
-        root.square[r] = abs(root.trial[r]) if above else np.float32(np.inf)
+        root.size[r] = abs(root.trial[r]) if above else np.float32(np.inf)
         steep += 1 if above else 0
     if steep < options.min_samples:
         return math.nan
@@ -545,12 +544,12 @@ def outliers(
     finest = (
         MIN_ROOT_SCALE * level / np.cbrt(level * level + options.floor * options.floor)
     )
-    scale = max(1.4826 * median_of(root.square, root.square_bits, count, steep), finest)
+    scale = max(1.4826 * median_of(root.size, root.size_bits, count, steep), finest)
     beyond = 0
     per_scale = BINS_PER_SCALE / scale
     for r in range(count):
-        if root.square[r] < np.inf:
-            place = min(int(root.square[r] * per_scale), last)
+        if root.size[r] < np.inf:
+            place = min(int(root.size[r] * per_scale), last)
             counts[b.pairs[r, 0], b.pairs[r, 1], place] += 1
             beyond += place == last
     return beyond / steep
@@ -566,12 +565,12 @@ def weigh_outliers(
     mean = _root_residuals(count, np.float32(options.floor), b, root)
     for r in range(count):
         root.trial[r] = abs(root.trial[r]) * math.sqrt(b.weight[r])
-        root.square[r] = root.trial[r]
+        root.size[r] = root.trial[r]
     level = max(mean, options.floor)
     finest = (
         MIN_ROOT_SCALE * level / np.cbrt(level * level + options.floor * options.floor)
     )
-    scale = 1.4826 * median_of(root.square, root.square_bits, count, count)
+    scale = 1.4826 * median_of(root.size, root.size_bits, count, count)
     limit = OUTLIER_LIMIT * max(scale, finest)
     for r in range(count):
         z = root.trial[r] / limit
@@ -580,61 +579,56 @@ def weigh_outliers(
 
 
 @fast_kernel
-def _squares(
-    predicted: Vector32, measured: Vector32, q: Vector32, roots: Vector32
-) -> tuple[float, float, float, float]:
-    """Sums of squared differences and of squared values, linear and in cube-root space.
-
-    In cube-root space the prediction is `predicted` q and the measured value is `roots`.
+def _add_squares(
+    predicted: Vector32, measured: Vector32, floor: np.float32, sums: Vector
+) -> None:
+    """Add the sums of squared differences and of squared values, linear and in cube-root
+    space, to sums (4,). Vector registers hold eight sums each in single precision.
     """
-    wrong = 0.0
-    total = 0.0
-    wrong_root = 0.0
-    total_root = 0.0
+    wrong = ZERO
+    total = ZERO
+    wrong_root = ZERO
+    total_root = ZERO
     for i in range(measured.shape[0]):
-        d = predicted[i] - measured[i]
-        e = predicted[i] * q[i] - roots[i]
+        m = measured[i]
+        p = predicted[i]
+        root = m * inverse_root(m * m + floor * floor)
+        d = p - m
+        e = p * inverse_root(p * p + floor * floor) - root
         wrong += d * d
-        total += measured[i] * measured[i]
+        total += m * m
         wrong_root += e * e
-        total_root += roots[i] * roots[i]
-    return wrong, total, wrong_root, total_root
+        total_root += root * root
+    sums[0] += wrong
+    sums[1] += total
+    sums[2] += wrong_root
+    sums[3] += total_root
 
 
 @kernel
 def relative_errors(
-    predicted: Matrix32, measured: Matrix32, floor: float, root: RootMemory
+    predicted: Matrix32, measured: Matrix32, n: int, floor: float
 ) -> tuple[float, float]:
-    """RMS error over RMS of `measured`, both (channels, n), linear and in cube-root
+    """RMS error over RMS of `measured`, both (channels, >= n), linear and in cube-root
     space; NaN if `measured` is zero.
     """
-    n = measured.shape[1]
-    single_floor = np.float32(floor)
-    q = root.inverse[:n]
-    roots = root.mixed[:n]
     sums = np.zeros(4)
     for c in range(measured.shape[0]):
-        to_roots(measured[c], single_floor, root)
-        for i in range(n):
-            roots[i] = measured[c, i] * q[i]
-        to_roots(predicted[c], single_floor, root)
-        part = _squares(predicted[c], measured[c], q, roots)
-        for k in range(4):
-            sums[k] += part[k]
+        _add_squares(predicted[c][:n], measured[c][:n], np.float32(floor), sums)
     if sums[1] > 0.0:
         return math.sqrt(sums[0] / sums[1]), math.sqrt(sums[2] / sums[3])
     return math.nan, math.nan
 
 
 @kernel
-def add_surface(count: int, b: Lumitexel, root: RootMemory) -> tuple[float, float]:
+def add_surface(count: int, b: Lumitexel) -> tuple[float, float]:
     """Add the surface in `b.surface` to the diffuse part of the samples; returns the
     relative errors of this prediction, linear and in cube-root space.
     """
     for c in range(3):
         for r in range(count):
             b.scattered[c, r] += b.surface[r]
-    return relative_errors(b.scattered[:, :count], b.sample[:, :count], NO_FLOOR, root)
+    return relative_errors(b.scattered, b.sample, count, NO_FLOOR)
 
 
 @kernel

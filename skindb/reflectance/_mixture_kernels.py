@@ -22,6 +22,7 @@ from skindb.reflectance._lumitexel_kernels import (
     NOT_CONVERGED,
     NOT_FINITE,
     RootMemory,
+    inverse_root,
     relative_errors,
     root_memory,
     slopes,
@@ -94,8 +95,9 @@ class Problem(NamedTuple):
     """Samples of one surfel, all of about order one, as mixtures of rows."""
 
     rows: Matrix32  # (>= n, width)
-    target: Matrix32  # (channels, n)
+    target: Matrix32  # (channels, >= n)
     weight: Vector32  # (>= n,)
+    size: int  # n
     lift: Matrix  # (r, m) from the space of the rows; a square one is the identity
     perceptual: bool  # in cube-root space
     floor: float  # below which values are compared linearly
@@ -162,7 +164,7 @@ def _solve_linear(
     right = work.right
     gram(
         p.rows,
-        p.target.shape[1],
+        p.size,
         work.slope,
         work.aim,
         work.reduced_gram,
@@ -205,7 +207,7 @@ def fit_weighted(
     root is concave). Returns the KKT residual, the iterations, whether it converged,
     and the condition.
     """
-    n = p.target.shape[1]
+    n = p.size
     channels = np.float32(p.target.shape[0])
     total = work.root.total
     for i in range(n):
@@ -215,7 +217,7 @@ def fit_weighted(
             total[i] += p.target[c, i]
     if p.perceptual:
         predict(p.rows, n, coefficients(p.lift, x), work.predicted, work.single)
-        slopes(work.predicted[:n], np.float32(p.floor), work.root, work.slope)
+        slopes(work.predicted[:n], np.float32(p.floor), work.slope)
     for i in range(n):
         work.slope[i] *= p.weight[i]
         work.aim[i] = work.slope[i] * total[i]
@@ -246,7 +248,7 @@ def _misfit(
     y: Vector32, q: Vector32, weight: Vector32, channels: np.float32, roots: Vector32
 ) -> float:
     """Squared distance in cube-root space, without the terms that do not depend on the
-    prediction.
+    prediction y; q is from `to_roots`.
     """
     total = 0.0
     for i in range(y.shape[0]):
@@ -275,28 +277,29 @@ def _linearise(
         )
 
 
-@kernel
-def _sum_channels(target: Matrix32, floor: np.float32, work: FitMemory) -> None:
+@fast_kernel
+def _sum_channels(p: Problem, floor: np.float32, work: FitMemory) -> None:
     """Write the sums over channels of the targets and of their cube roots."""
-    n = target.shape[1]
+    n = p.size
     total = work.root.total
     for i in range(n):
         total[i], work.roots[i] = ZERO, ZERO
-    for c in range(target.shape[0]):
-        to_roots(target[c], floor, work.root)
+    for c in range(p.target.shape[0]):
+        target = p.target[c]
         for i in range(n):
-            total[i] += target[c, i]
-            work.roots[i] += target[c, i] * work.root.inverse[i]
+            t = target[i]
+            total[i] += t
+            work.roots[i] += t * inverse_root(t * t + floor * floor)
 
 
 @kernel
 def _step_from_data(p: Problem, floor: np.float32, x: Vector, work: FitMemory) -> int:
     """A first step that linearises at the data; returns the iterations."""
-    n = p.target.shape[1]
+    n = p.size
     channels = np.float32(p.target.shape[0])
     for i in range(n):
         work.predicted[i] = max(work.root.total[i], ZERO) / channels
-    to_roots(work.predicted[:n], floor, work.root)
+    to_roots(work.predicted[:n], floor, work.root.inverse)
     _linearise(n, p.weight, channels, floor, work)
     _, count, _, _ = _solve_linear(p, x, work)
     return count
@@ -311,7 +314,7 @@ def _search_line(
 
     Predictions are linear in x, so a shorter step needs no solve and stays non-negative.
     """
-    n = p.target.shape[1]
+    n = p.size
     y = work.predicted
     trial = work.root.trial
     mixed = work.root.mixed[:n]
@@ -320,7 +323,7 @@ def _search_line(
     for _ in range(HALVINGS):
         for i in range(n):
             mixed[i] = y[i] + step * (trial[i] - y[i])
-        to_roots(mixed, floor, work.root)
+        to_roots(mixed, floor, work.root.inverse)
         value = _misfit(
             mixed,
             work.root.inverse[:n],
@@ -339,7 +342,7 @@ def _fit_roots(p: Problem, x: Vector, work: FitMemory) -> int:
     """Minimise the distance in cube-root space by Gauss-Newton with a line search;
     returns the iterations.
     """
-    n = p.target.shape[1]
+    n = p.size
     channels = np.float32(p.target.shape[0])
     floor = np.float32(p.floor)
     y = work.predicted[:n]
@@ -347,12 +350,12 @@ def _fit_roots(p: Problem, x: Vector, work: FitMemory) -> int:
     started = False
     for j in range(x.shape[0]):
         started = started or x[j] > 0.0
-    _sum_channels(p.target, floor, work)
+    _sum_channels(p, floor, work)
     count = 0
     if not started:
         count = _step_from_data(p, floor, x, work)
     predict(p.rows, n, coefficients(p.lift, x), y, work.single)
-    to_roots(y, floor, work.root)
+    to_roots(y, floor, work.root.inverse)
     level = 0.0
     for i in range(n):
         level += p.weight[i] * roots[i] * roots[i] / channels
@@ -457,8 +460,9 @@ def fit_many(
     )
     problem = Problem(
         scaled.rows,
-        scaled.target[:, :size],
+        scaled.target,
         scaled.weight,
+        size,
         lift,
         perceptual,
         floor,
@@ -502,14 +506,14 @@ def _fit_scaled(
     square = lift.shape[0] == lift.shape[1]
     scale = _to_order_one(rows, target, weight, not square, scaled)
     floor = max(problem.floor / scale, MIN_NOISE_FLOOR)
-    targets = scaled.target[:, :n]
     x = out.parameters[s]
     x[:] = 0.0
     out.kkt[s], out.iterations[s], converged, out.condition[s] = fit_one(
         Problem(
             scaled.rows,
-            targets,
+            scaled.target,
             scaled.weight,
+            n,
             lift,
             problem.perceptual,
             floor,
@@ -519,11 +523,11 @@ def _fit_scaled(
         work,
     )
     predict(scaled.rows, n, coefficients(lift, x), work.predicted, work.single)
-    for c in range(targets.shape[0]):
+    for c in range(scaled.target.shape[0]):
         for i in range(n):
             scaled.predicted[c, i] = work.predicted[i]
     out.residual[s], out.residual_perceptual[s] = relative_errors(
-        scaled.predicted[:, :n], targets, floor, work.root
+        scaled.predicted, scaled.target, n, floor
     )
     for j in range(x.shape[0]):
         x[j] *= scale / (scaled.lengths[j] if square else scaled.lengths[0])
@@ -552,7 +556,7 @@ def _scores(
     for i in range(n):
         t[i], a[i] = ZERO, ONE
     if perceptual:
-        slopes(y, np.float32(floor), work.root, a)
+        slopes(y, np.float32(floor), a)
     for i in range(n):
         a[i] *= weight[i]
     for c in range(scattered.shape[0]):

@@ -18,15 +18,6 @@ from skindb.reflectance.mixture import fit_reflectance
 ROUNDING = 1e-7
 
 
-def _as_fits_give(values):
-    """Part of a larger array in single precision, as in the fit of a face, so that no
-    other version is compiled.
-    """
-    wide = np.zeros((values.shape[0], values.shape[1] + 1), np.float32)
-    wide[:, :-1] = values
-    return wide[:, :-1]
-
-
 def _problem(seed: int, n: int = 60, m: int = 9):
     rng = np.random.default_rng(seed)
     rows = rng.uniform(0.0, 1.0, (n, m)).astype(np.float32)
@@ -115,10 +106,10 @@ def _check_minimum(seed):
     )
     x = np.zeros(m)
     filled = np.pad(rows, ((0, 0), (0, 7)))
-    given = _as_fits_give(target.T)
+    given = np.ascontiguousarray(target.T, np.float32)
     work = _mixture_kernels.fit_memory(n, 16, m)
     problem = _mixture_kernels.Problem(
-        filled, given, np.ones(n, np.float32), np.eye(m), True, floor, 1e-10
+        filled, given, np.ones(n, np.float32), n, np.eye(m), True, floor, 1e-10
     )
     _mixture_kernels._fit_roots(problem, x, work)
     assert objective(x) <= best * (1 + 1e-4)  # Gauss-Newton stops at a gain of 1e-6
@@ -250,14 +241,14 @@ def test_weight_covariance__is_the_sandwich_in_plain_numpy(perceptual):
     x = np.zeros(4)
     covariance = np.empty((4, 4))
     filled = np.pad(rows, ((0, 7), (0, 4)))
-    given = _as_fits_give(target.T)
+    given = np.ascontiguousarray(target.T, np.float32)
     weight = rng.uniform(0.2, 1, n).astype(np.float32)
     problem = _mixture_kernels.Problem(
-        filled, given, weight, np.eye(4), perceptual, floor, 1e-10
+        filled, given, weight, n, np.eye(4), perceptual, floor, 1e-10
     )
     _mixture_kernels.fit_one(problem, x, work)
     y = rows.astype(np.float64) @ x
-    scattered = _as_fits_give(scattered)
+    scattered = scattered.astype(np.float32)
     _mixture_kernels.weight_covariance(
         filled,
         y.astype(np.float32),
@@ -299,12 +290,12 @@ def test_weight_covariance__collinear_columns_have_none():
     covariance = np.empty((2, 2))
     filled = np.pad(rows, ((0, 0), (0, 6)))
     ones = np.ones(50, np.float32)
-    given = _as_fits_give(np.repeat(rows[:, :1].T, 3, axis=0))
+    given = np.repeat(rows[:, :1].T, 3, axis=0)
     problem = _mixture_kernels.Problem(
-        filled, given, ones, np.eye(2), False, 1.0, 1e-10
+        filled, given, ones, 50, np.eye(2), False, 1.0, 1e-10
     )
     _mixture_kernels.fit_one(problem, np.zeros(2), work)
-    nothing = _as_fits_give(np.zeros((3, 50))), np.zeros(3)
+    nothing = np.zeros((3, 50), np.float32), np.zeros(3)
     _mixture_kernels.weight_covariance(
         filled,
         0 * ones,

@@ -21,7 +21,7 @@ from three_surfels import (
 
 from skindb.fit.surface import MIN_SAMPLES, NOISE_FLOOR_SURFACE
 from skindb.optics.angles import half_difference
-from skindb.reflectance import _row_kernels
+from skindb.reflectance import _lumitexel_kernels, _row_kernels
 from skindb.reflectance.dictionary import convolve_disc, embedded_dictionary
 from skindb.reflectance.mixture import Mixture, basis_rows
 from skindb.reflectance.model import Comparison, Lamp, Points
@@ -420,6 +420,16 @@ def test_table_grid__nodes():
     )
     np.testing.assert_allclose(grid.theta_d, [0, np.pi / 4, np.pi / 2])
     np.testing.assert_allclose(grid.phi_d, [0, np.pi / 4, np.pi / 2, 3 * np.pi / 4])
+
+
+def test_to_roots__every_magnitude():
+    y = np.concatenate(
+        [-np.geomspace(1e-15, 1e15, 999), [0], np.geomspace(1e-15, 1e15, 999)]
+    )
+    q = np.empty(len(y), np.float32)
+    floor = 1e-8
+    _lumitexel_kernels.to_roots(y.astype(np.float32), np.float32(floor), q)
+    np.testing.assert_allclose(q, np.cbrt(y**2 + floor**2) ** -1, rtol=1e-6)
 
 
 def test_turn_rows__are_the_rows_of_the_other_normal():
