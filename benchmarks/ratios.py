@@ -187,11 +187,12 @@ def ingesting(bench: Bench) -> list[Row]:
         exr = merged(folder, bench.folder / f"{name}-exr")
         for capture, kind in ((folder, "PNG"), (exr, "OpenEXR")):
             result = ingest.measure(capture, stride=1)
-            for stage, decoded, text in (
-                ("all", "all", "ingest"),
-                ("sample", "frames", "decoding, merging and sampling"),
+            sampling = "decoding, merging, sampling and refinement"
+            for stages, decoded, text in (
+                (["all"], "all", "ingest"),
+                (["sample", "refine"], "frames", sampling),
             ):
-                seconds = result["stages"][stage]["cpu"]
+                seconds = sum(result["stages"][stage]["cpu"] for stage in stages)
                 peer = result["decoding"][decoded]
                 work = f"{text}, {peer['frames']:.0f} {name} {kind} frames, CPU time"
                 rows.append(

@@ -51,11 +51,10 @@ from skindb.ingest.groups import (
 )
 from skindb.ingest.lumitexels import (
     Lumitexels,
+    Sampler,
     Views,
-    checked_pictures,
     choose_photographs,
     fully_lit,
-    sample_lumitexels,
 )
 from skindb.ingest.probe_profiles import fibre_profiles, isotropy_p_values, probe_notes
 from skindb.ingest.refinement import (
@@ -294,18 +293,26 @@ class _DomeStages:
         check = CalibrationCheck(
             self.dome, surfels, light_fraction, clear, pixels, intensity
         )
+        sampler = self._sampler(mergers, check)
         rotations = np.zeros((len(self.dome.cameras), 3))
         if parameters.refine is not False and not self.run.faults:
-            refined = self._refined(check, mergers)
-            if refined is None:
-                return {}
+            refined = self._refined(check, sampler)
             if refined is not self.dome:
                 rotations = applied_rotations(self.dome, refined)
+            self._require_cameras(rotations)
+            if refined is not self.dome:
                 self.dome = refined
                 visible, clear, pixels = sees(refined.cameras)
                 check = replace(check, dome=refined, clear=clear, pixels=pixels)
+                sampler = self._sampler(mergers, check)
             self.run.report("refine", 1, 1)
-        lumitexels = self._lumitexels(mergers, check)
+        lumitexels = attempt(
+            self.run.faults,
+            lambda: sampler.lumitexels(
+                None if self.run.faults else check,
+                refuse=parameters.calibration == "refuse",
+            ),
+        )
         if lumitexels is None:
             return {}
         if measured and not self.run.faults:
@@ -320,66 +327,63 @@ class _DomeStages:
         self._note(lumitexels, mergers, intensity)
         return self._labelled(lumitexels, check, visible, rotations)
 
-    def _refined(
-        self, check: CalibrationCheck, mergers: Mapping[str, FrameMerger]
-    ) -> DomeRecord | None:
-        """The dome with rotated cameras, or as it is if that is chosen; None, with the
-        faults of the pictures recorded, if there are any.
+    def _refined(self, check: CalibrationCheck, sampler: Sampler) -> DomeRecord:
+        """The dome with rotated cameras, or as it is if that is chosen or a photograph
+        has a fault.
+
+        The photographs that show this are sampled with the cameras as they are, and
+        again if the cameras are rotated.
         """
         choose = self.run.parameters.refine == "auto"
         if choose and (reason := reason_to_skip(check)):
             self._record(reason)
             return self.dome
         held_out = held_out_lights(check) if choose else frozenset[int]()
-        pairs = pictures_to_judge(check, held_out)
-        pictures = attempt(
-            self.run.faults,
-            lambda: checked_pictures(check, pairs, mergers, pool=self.pool),
-        )
-        if pictures is None:
-            return None
+        pictures = sampler.pictures(check, pictures_to_judge(check, held_out))
+        if sampler.faults:
+            return self.dome
         if not choose:
             return refine_cameras(check, check.views(pictures))
         dome, reason = choose_refinement(check, pictures, held_out)
         self._record(reason)
         return dome
 
+    def _require_cameras(self, rotations: Float64) -> None:
+        """Empty the spool unless its samples are those of cameras with these rotations."""
+        name = "rotations"
+        earlier = self.spool.kept(name)
+        if not np.array_equal(rotations, 0 * rotations if earlier is None else earlier):
+            self.spool.restart()
+            self.spool.keep(name, rotations)
+
     def _record(self, reason: str) -> None:
         """Record why the refinement was chosen or not."""
         self.run.summary["corrections"] = {"refine": reason}
 
-    def _lumitexels(
+    def _sampler(
         self, mergers: Mapping[str, FrameMerger], check: CalibrationCheck
-    ) -> Lumitexels | None:
-        """The samples; None, with its faults recorded, if there are any."""
+    ) -> Sampler:
         surfels = self.run.surfels
+        parameters = self.run.parameters
         light_fraction = check.light_visible
-        soft = self.run.parameters.soft
         views = Views(
             surfels,
-            fully_lit(surfels, light_fraction, self.dome.cameras, soft=soft),
+            fully_lit(surfels, light_fraction, self.dome.cameras, soft=parameters.soft),
             check.clear,
             check.pixels,
-            light_fraction=light_fraction if soft == "keep" else None,
-            footprint=self.run.parameters.footprint,
+            light_fraction=light_fraction if parameters.soft == "keep" else None,
+            footprint=parameters.footprint,
         )
         middle = surfels.position.mean(axis=0)
-        count = self.run.parameters.photographs
-        earlier_faults = bool(self.run.faults)
-        return attempt(
-            self.run.faults,
-            lambda: sample_lumitexels(
-                self.dome,
-                check.intensity,
-                views,
-                mergers,
-                self.spool,
-                kept=choose_photographs(self.dome, middle, count),
-                check=None if earlier_faults else check,
-                refuse=self.run.parameters.calibration == "refuse",
-                pool=self.pool,
-                progress=self.run.report,
-            ),
+        return Sampler(
+            self.dome,
+            check.intensity,
+            views,
+            mergers,
+            self.spool,
+            self.pool,
+            self.run.report,
+            kept=choose_photographs(self.dome, middle, parameters.photographs),
         )
 
     def _labelled(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Literal, TypeVar
 
@@ -157,20 +157,9 @@ def fully_lit(
     return lit
 
 
-def sample_lumitexels(
-    dome: DomeRecord,
-    intensity: Float64,
-    views: Views,
-    mergers: Mapping[str, FrameMerger],
-    spool: Spool,
-    *,
-    kept: Collection[Pair] = (),
-    check: CalibrationCheck | None = None,
-    refuse: bool = True,
-    pool: Executor,
-    progress: Progress = silent,
-) -> Lumitexels:
-    """Decode, merge and sample every view that the spool does not hold yet.
+@dataclass
+class Sampler:
+    """Decodes, merges and samples views, each once, into a spool.
 
     Parameters
     ----------
@@ -184,76 +173,96 @@ def sample_lumitexels(
         Frame merger of every camera, by id.
     spool
         Receives the samples rho = L d^2 / (I falloff).
-    kept
-        (light, camera) pairs whose merged radiance is kept.
-    check
-        Views of its pairs come first, and the calibration is checked by them.
-    refuse
-        Whether a calibration that the photographs contradict is an error.
     pool, progress
         Threads that decode; callback with the stage, the number of views done, and
         their total number.
-
-    Raises
-    ------
-    InputError
-        With every frame that cannot be decoded, or for a calibration that the
-        photographs contradict.
+    kept
+        (light, camera) pairs whose merged radiance is kept.
+    faults
+        Receives the faults of the views.
     """
-    checked = frozenset[Pair]() if check is None else check.pairs
-    cameras = range(len(dome.cameras))
-    shots = list(
-        pool.map(lambda c: _camera_sampling(views, dome.cameras[c], c), cameras)
-    )
-    levels = ViewLevels.empty(spool.done.shape)
-    sampler = _Sampler(
-        dome, intensity, views, mergers, spool, frozenset(kept), check, shots, levels
-    )
-    faults = list[Fault]()
-    missing = [(int(j), int(c)) for j, c in np.argwhere(~spool.done)]
-    count = spool.done.size - len(missing)
-
-    def sample(pairs: Iterable[Pair]) -> None:
-        nonlocal count
-        for view_faults in _in_turn(pool, sampler.faults, pairs):
-            faults.extend(view_faults)
-            count += 1
-            progress("sample", count, spool.done.size)
-
-    sample(pair for pair in missing if pair in checked)
-    calibration = None if check is None or faults else _evaluated(check, spool)
-    contradictions = []
-    if calibration is not None and refuse:
-        contradictions = calibration_faults(dome, calibration)
-    if not contradictions:  # otherwise hours of sampling would end with the same faults
-        sample(pair for pair in missing if pair not in checked)
-    if faults or contradictions:
-        raise InputError(faults + contradictions)
-    return sampler.lumitexels(calibration)
-
-
-@dataclass(frozen=True)
-class _Sampler:
-    """Samples single views into the spool; the arguments of `sample_lumitexels`."""
 
     dome: DomeRecord
     intensity: Float64
     views: Views
     mergers: Mapping[str, FrameMerger]
     spool: Spool
-    kept: frozenset[Pair]
-    check: CalibrationCheck | None
-    shots: list[CameraSampling]  # by camera
-    levels: ViewLevels
+    pool: Executor
+    progress: Progress = silent
+    kept: Collection[Pair] = ()
+    faults: list[Fault] = field(default_factory=list)
 
-    def faults(self, pair: Pair) -> list[Fault]:
-        """Sample a view; its faults, if it has any."""
-        faults = list[Fault]()
-        attempt(faults, lambda: self._sample(*pair))
-        return faults
+    def __post_init__(self) -> None:
+        self._levels = ViewLevels.empty(self.spool.done.shape)
+        self._sampled = self.spool.done.copy()  # or found to be faulty
+        cameras = enumerate(self.dome.cameras)
+        call = partial(_camera_sampling, self.views)
+        self._shots = list(self.pool.map(call, *zip(*cameras, strict=True)))
 
-    def lumitexels(self, calibration: Calibration | None) -> Lumitexels:
-        """The samples and counts of all views in the spool."""
+    def pictures(
+        self, check: CalibrationCheck, pairs: Collection[Pair]
+    ) -> dict[Pair, NDArray[np.float32]]:
+        """Downsampled photographs of these views, which are sampled unless they are in
+        the spool, also of an interrupted run.
+        """
+        kept = self._kept_pictures(check, pairs)
+        missing = frozenset(pairs) - kept.keys()
+        self._sample(missing, check)
+        return kept | self._kept_pictures(check, missing)
+
+    def _kept_pictures(
+        self, check: CalibrationCheck, pairs: Iterable[Pair]
+    ) -> dict[Pair, NDArray[np.float32]]:
+        images = {pair: self.spool.kept(_picture_name(check, pair)) for pair in pairs}
+        return {pair: image for pair, image in images.items() if image is not None}
+
+    def lumitexels(
+        self, check: CalibrationCheck | None = None, *, refuse: bool = True
+    ) -> Lumitexels:
+        """The samples and counts of all views.
+
+        Parameters
+        ----------
+        check
+            Views of its pairs come first, and the calibration is checked by them.
+        refuse
+            Whether a calibration that the photographs contradict is an error.
+
+        Raises
+        ------
+        InputError
+            With every frame that cannot be decoded, or for a calibration that the
+            photographs contradict.
+        """
+        calibration = None
+        contradictions = list[Fault]()
+        if check is not None:
+            pictures = self.pictures(check, check.pairs)
+            calibration = None if self.faults else check.evaluate(pictures)
+        if calibration is not None and refuse:
+            contradictions = calibration_faults(self.dome, calibration)
+        # otherwise hours of sampling would end with the same faults
+        if not contradictions:
+            self._sample(np.ndindex(self._sampled.shape))
+        if self.faults or contradictions:
+            raise InputError(self.faults + contradictions)
+        return self._lumitexels(calibration)
+
+    def _sample(
+        self, pairs: Iterable[Pair], check: CalibrationCheck | None = None
+    ) -> None:
+        """Sample those of the views that are not sampled; with a check, keep their
+        downsampled photographs.
+        """
+        missing = sorted((j, c) for j, c in pairs if not self._sampled[j, c])
+        call = partial(attempt, self.faults)
+        sample = partial(self._sample_view, check)
+        ended = _in_turn(self.pool, lambda pair: call(partial(sample, *pair)), missing)
+        for pair, _ in zip(missing, ended, strict=True):
+            self._sampled[pair] = True
+            self.progress("sample", int(self._sampled.sum()), self._sampled.size)
+
+    def _lumitexels(self, calibration: Calibration | None) -> Lumitexels:
         surfels = self.views.surfels
         usable, saturated, dark, single = self.spool.counts
         photographs = {}
@@ -261,7 +270,7 @@ class _Sampler:
             image = self.spool.kept(f"photograph-{j}-{c}")
             if image is not None:
                 photographs[j, c] = image
-        pixels = _effective_pixels(self.dome, self.shots)
+        pixels = _effective_pixels(self.dome, self._shots)
         return Lumitexels(
             sample=self.spool.samples(),
             sample_count=usable,
@@ -269,7 +278,7 @@ class _Sampler:
             dark_count=dark,
             single_count=single,
             view_count=self.spool.views,
-            views=self.levels,
+            views=self._levels,
             noise_floor=noise_floor(self.dome, self.intensity, surfels),
             shot_noise=shot_noise(self.dome, self.intensity, surfels),
             photographs=photographs,
@@ -277,11 +286,10 @@ class _Sampler:
             noise=sample_noise(self.dome, self.views.pixels, pixels),
         )
 
-    def _sample(self, j: int, c: int) -> None:
+    def _sample_view(self, check: CalibrationCheck | None, j: int, c: int) -> None:
         light = self.dome.lights[j]
         merger = self.mergers[self.dome.cameras[c].id]
-        shot = self.shots[c]
-        check = self.check if self.check and (j, c) in self.check.pairs else None
+        shot = self._shots[c]
         digests: Digests = {}
         frames = checked_view(self.dome, light.id, merger, digests=digests)
         surfels = shot.surfels & self.views.lit[:, j]
@@ -295,10 +303,11 @@ class _Sampler:
             self.spool.keep(f"photograph-{j}-{c}", radiance)
         if check is not None:
             _lose_saturated(radiance, flag)
-            self.spool.keep(f"calibration-{j}-{c}", check.reduce(c, radiance))
+            picture = check.reduce(c, radiance)
+            self.spool.keep(_picture_name(check, (j, c)), picture)
         samples, outcome = self._gathered(merged, shot, surfels, j)
         count, lit, median, bright = view_levels(samples, outcome, MAX_SAMPLE)
-        levels = self.levels
+        levels = self._levels
         if count >= MIN_MEDIAN_SAMPLES:
             require(
                 # samples of a strong light may be zero in half precision alone
@@ -342,56 +351,14 @@ class _Sampler:
         return out, outcome
 
 
-def checked_pictures(
-    check: CalibrationCheck,
-    pairs: Collection[Pair],
-    mergers: Mapping[str, FrameMerger],
-    *,
-    pool: Executor,
-) -> dict[Pair, NDArray[np.float32]]:
-    """The downsampled photographs of these views, before anything is sampled.
-
-    Raises
-    ------
-    InputError
-        With every frame that cannot be decoded or that cannot be a photograph.
-    """
-    dome = check.dome
-    faults = list[Fault]()
-
-    def picture(pair: Pair) -> NDArray[np.float32]:
-        j, c = pair
-        merger = mergers[dome.cameras[c].id]
-        frames = checked_view(dome, dome.lights[j].id, merger)
-        radiance, flag = merger.merge(frames)
-        _lose_saturated(radiance, flag)
-        return check.reduce(c, radiance)
-
-    ordered = sorted(pairs)
-    call = partial(attempt, faults)
-    pictures = list(_in_turn(pool, lambda pair: call(partial(picture, pair)), ordered))
-    if faults:
-        raise InputError(faults)
-    return {
-        pair: image
-        for pair, image in zip(ordered, pictures, strict=True)
-        if image is not None
-    }
+def _picture_name(check: CalibrationCheck, pair: Pair) -> str:
+    j, c = pair
+    return f"picture-{j}-{c}-{check.factor(c)}"
 
 
 def _lose_saturated(radiance: Image, flag: NDArray[np.uint8]) -> None:
     """Set saturated pixels to NaN."""
     radiance[flag == SATURATED] = np.nan
-
-
-def _evaluated(check: CalibrationCheck, spool: Spool) -> Calibration:
-    """Check the calibration by the pictures of this run and of an interrupted one that
-    it resumes.
-    """
-    pictures = {(j, c): spool.kept(f"calibration-{j}-{c}") for j, c in check.pairs}
-    return check.evaluate(
-        {pair: image for pair, image in pictures.items() if image is not None}
-    )
 
 
 def footprints(surfels: SurfelSet, camera: CameraRecord) -> NDArray[np.float32]:
@@ -417,7 +384,7 @@ def footprints(surfels: SurfelSet, camera: CameraRecord) -> NDArray[np.float32]:
     return np.asarray(spread + pixel, np.float32)
 
 
-def _camera_sampling(views: Views, camera: CameraRecord, c: int) -> CameraSampling:
+def _camera_sampling(views: Views, c: int, camera: CameraRecord) -> CameraSampling:
     surfels = views.clear[:, c] & _frontal(camera, views.surfels)
     spread = np.zeros((0, 3), np.float32)
     if views.footprint:

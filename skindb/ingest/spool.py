@@ -168,6 +168,13 @@ class Spool:
             os.fsync(self._file)
             self._replace(JOURNAL, content.getvalue())
 
+    def restart(self) -> None:
+        """Forget all views, but no small array."""
+        # before the first sample is overwritten, as a later run would trust the journal
+        (self.folder / JOURNAL).unlink(missing_ok=True)
+        for array in (self.done, self.views, self.counts):
+            array[:] = 0
+
     def samples(self) -> da.Array:
         """Samples (n, light, camera, 3), read lazily in the shards of the store."""
         lights, cameras, n = self.shape
@@ -224,9 +231,9 @@ class Spool:
                     self.counts = journal["counts"]
                     self.digests |= state["digests"]
                     return
-        # before the first sample is overwritten, as a later run with the old frames
-        # would trust the journal
-        (self.folder / JOURNAL).unlink(missing_ok=True)
+        for path in self.folder.glob("*.npy"):  # of other frames
+            path.unlink()
+        self.restart()
 
     def _sealed(self, name: str) -> io.BytesIO | None:
         """Content that `_replace` wrote under a name; None if it is absent, damaged, or

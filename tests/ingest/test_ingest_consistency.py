@@ -19,7 +19,7 @@ from skindb.calibration.radiance import frame_mergers, read_view
 from skindb.errors import InputError
 from skindb.format.folder import read_capture
 from skindb.geometry.rays import RayScene
-from skindb.ingest import IngestParameters, ingest_capture
+from skindb.ingest import IngestParameters, ingest_capture, lumitexels
 from skindb.ingest.consistency import CalibrationCheck
 from skindb.ingest.faults import calibration_faults, calibration_notes
 from skindb.ingest.photo_offsets import (
@@ -539,6 +539,63 @@ def test_ingest_capture__refine_stores_the_rotations(shoot, tmp_path):
     ]
     np.testing.assert_allclose(applied, expected, atol=1e-5)
     assert 0 < np.abs(applied).max() < 0.3
+
+
+def test_ingest_capture__judges_and_samples_views_by_decoding_them_once(
+    shoot, tmp_path, monkeypatch
+):
+    decoded = []
+    plain = lumitexels.checked_view
+    monkeypatch.setattr(
+        lumitexels, "checked_view", lambda *a, **k: decoded.append(a) or plain(*a, **k)
+    )
+    capture = read_capture(shoot.folder)
+    parameters = IngestParameters(spacing_mm=8.0)
+    with ingest_capture(capture, parameters, scratch=tmp_path) as tree:
+        reason = tree.attrs["summary"]["corrections"]["refine"]
+    assert reason.startswith("off: not needed")
+    assert len(decoded) == LIGHTS * CAMERAS
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("views", [5, LIGHTS * CAMERAS])
+def test_ingest_capture__interrupted_with_rotated_cameras_has_the_same_samples(
+    shoot, tmp_path, views
+):
+    """Samples taken before the cameras are rotated are never mixed with later ones."""
+    capture = read_capture(shoot.folder)
+    capture = replace(capture, dome=_misplaced(capture.dome))
+    parameters = IngestParameters(spacing_mm=8.0)
+    stages = []
+
+    def interrupt(stage, step, _):
+        stages.append(stage)
+        if (stage, step) == ("sample", views) and (views == 5 or "refine" in stages):
+            raise KeyboardInterrupt
+
+    with (
+        pytest.raises(KeyboardInterrupt),
+        ingest_capture(capture, parameters, scratch=tmp_path, progress=interrupt),
+    ):
+        pass
+    results = []
+    for refine, folder in (("auto", "."), ("auto", "whole"), (False, "as it is")):
+        with ingest_capture(
+            capture, replace(parameters, refine=refine), scratch=tmp_path / folder
+        ) as tree:
+            results.append(tree.load())
+    resumed, whole, misplaced = results
+    assert whole.attrs["summary"] == resumed.attrs["summary"]
+    assert whole.attrs["summary"]["corrections"]["refine"].startswith("on,")
+    for group in ("samples", "calibration", "dome", "photographs"):
+        assert whole[group].to_dataset().identical(resumed[group].to_dataset())
+    before, after = (
+        tree["samples/reflectance_sample"].values for tree in (misplaced, whole)
+    )
+    seen = np.isfinite(after).any(axis=(0, 3))
+    same = np.isclose(before, after, equal_nan=True).all(axis=(0, 3))
+    assert seen.any()
+    assert not (seen & same).any()
 
 
 def test_camera_offset__finds_a_planted_move_of_a_smooth_picture():

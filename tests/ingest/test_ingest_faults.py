@@ -32,7 +32,7 @@ from skindb.format.frames import FrameKind
 from skindb.format.sensor import UNKNOWN_ELECTRONS, SensorRecord
 from skindb.geometry.rays import RayScene
 from skindb.ingest.groups import dome_group, sample_group, surfel_group
-from skindb.ingest.lumitexels import Views, sample_lumitexels
+from skindb.ingest.lumitexels import Sampler, Views
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import build_surfels, camera_visibility
 
@@ -89,7 +89,7 @@ def lumitexels_of(dome, surfels, folder, *, footprint):
         views = Views(
             surfels, np.ones((n, shape[0]), bool), clear, pixels, footprint=footprint
         )
-        found = sample_lumitexels(dome, intensity, views, mergers, spool, pool=pool)
+        found = Sampler(dome, intensity, views, mergers, spool, pool).lumitexels()
         groups = {
             "samples": sample_group(dome, found).compute(),
             "surfels": surfel_group(

@@ -16,13 +16,13 @@ from skindb.ingest.capture import MAX_THREADS
 from skindb.ingest.lumitexels import (
     LINEAR_NOISE_FLOOR,
     PIXEL_VARIANCE_PX2,
+    Sampler,
     Views,
     _in_turn,
     choose_photographs,
     footprints,
     fully_lit,
     noise_floor,
-    sample_lumitexels,
 )
 from skindb.ingest.report import (
     cleaning_lines,
@@ -152,15 +152,12 @@ def sampled(dome, surfels, folder, *, share=None, lit=None, footprint=False):
         views = Views(
             surfels, lit, clear, pixels, light_fraction=share, footprint=footprint
         )
-        found = sample_lumitexels(
-            dome, np.tile(INTENSITY, (shape[0], 1)), views, mergers, spool, pool=pool
-        )
+        intensity = np.tile(INTENSITY, (shape[0], 1))
+        found = Sampler(dome, intensity, views, mergers, spool, pool).lumitexels()
         return clear, replace(found, sample=found.sample.compute())
 
 
-def test_sample_lumitexels__kept_soft_edges_are_divided_by_the_share(
-    capture, surfels, tmp_path
-):
+def test_sampler__kept_soft_edges_are_divided_by_the_share(capture, surfels, tmp_path):
     share = np.full((len(surfels.position), 4), 0.5, np.float16)
     _, plain = sampled(capture.dome, surfels, tmp_path / "a")
     _, soft = sampled(capture.dome, surfels, tmp_path / "b", share=share)
@@ -171,9 +168,7 @@ def test_sample_lumitexels__kept_soft_edges_are_divided_by_the_share(
     )
 
 
-def test_sample_lumitexels__footprints_of_a_smooth_sphere_are_less_noisy(
-    capture, tmp_path
-):
+def test_sampler__footprints_of_a_smooth_sphere_are_less_noisy(capture, tmp_path):
     """Splats of 1.5 pixels: the mean over them is the point's value, with a fraction of
     its noise.
     """
@@ -225,9 +220,7 @@ def test_describe_samples__one_camera_one_light_and_none(capture, surfels, tmp_p
     ]
 
 
-def test_sample_lumitexels__counts_samples_of_a_single_exposure(
-    capture_folder, tmp_path
-):
+def test_sampler__counts_samples_of_a_single_exposure(capture_folder, tmp_path):
     """The noise of a value is 10: the short exposure of 15 above black is dark, of 2000
     it is not.
     """
@@ -250,7 +243,7 @@ def test_sample_lumitexels__counts_samples_of_a_single_exposure(
         assert ("single" in said) == (expected == 1)
 
 
-def test_sample_lumitexels__counts_what_is_lost(capture_folder, tmp_path):
+def test_sampler__counts_what_is_lost(capture_folder, tmp_path):
     """All exposures of one view at the white level except for a corner, and those of
     another at black.
     """

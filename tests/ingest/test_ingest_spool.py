@@ -78,6 +78,7 @@ def interrupt(folder, frames, put, found):
         ]
         for view, bits in put.items():
             target.put(*view, bits, np.zeros(5, np.uint8), {"f": "x"})
+            target.keep("picture", bits)
         raise KeyboardInterrupt
 
 
@@ -168,6 +169,7 @@ def test_spool__goes_on_from_its_journal_unless_frames_changed(tmp_path):
     with Spool(tmp_path / "a", (2, 2, 5), {"a": [1, 3]}, key="run") as target:
         assert not target.done.any()
         assert not target.counts.any()
+        assert target.kept("picture") is None
 
 
 def test_spool__an_older_note_never_replaces_a_newer_one(tmp_path, monkeypatch):
