@@ -2,7 +2,9 @@
 their camera, wrong levels, blank pictures.
 """
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+import threading
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -22,7 +24,7 @@ from skindb.format.fields import MAX_MAGNITUDE
 from skindb.format.frames import Digests, Frame, read_frame
 from skindb.format.sensor import SensorRecord
 from skindb.numerics.statistics import correlation, robust_deviation
-from skindb.types import Float32, Float64, Mask
+from skindb.types import Float32, Float64, Index, Mask
 
 # of a frame, evenly spread: takes 1 % of the time to decode 10 megapixels
 MAX_COMPARED_PIXELS = 40_000
@@ -433,66 +435,108 @@ def _thinned(frame: Frame) -> Frame:
     return frame[::step, ::step]
 
 
-def dark_pattern_fault(
-    dome: DomeRecord, camera: str, mergers: Mapping[str, FrameMerger]
-) -> Fault | None:
-    """Fault of the dark frames of a camera that match its photographs only turned, or
-    those of another camera.
+class SensorPatterns:
+    """Mean photograph of each camera that has dark frames, whose fixed pattern shows
+    whether they are those of this camera, turned as it is.
 
-    The fixed pattern of a sensor differs from pixel to pixel, so that even a small part
-    of it shows this. Compared is the shortest exposure, in which the least light hides
-    the pattern.
-
-    Raises
-    ------
-    InputError
-        If a photograph cannot be decoded.
+    The pattern differs from pixel to pixel, so that even a small part of it is enough.
+    Compared is the shortest exposure, in which the least light hides the pattern.
     """
-    merger = mergers[camera]
-    shortest = int(np.argmin(merger.seconds))
-    if merger.dark is None:
-        return None
-    dark = merger.dark[shortest]
-    step = -(-dark.shape[0] * dark.shape[1] // MAX_PATTERN_PIXELS)
-    exposure = [*dome.exposures][shortest]
-    kind = merger.camera.sensor.kind
-    photographs = [
-        read_frame(dome.frame(light.id, camera, exposure), kind)[::step].astype(
-            np.float32
+
+    def __init__(self, dome: DomeRecord, mergers: Mapping[str, FrameMerger]) -> None:
+        self._dome = dome
+        self._mergers = mergers
+        step = -(-len(dome.lights) // MAX_PHOTOGRAPHS)
+        # (light, camera) of the photographs
+        self.pairs = frozenset(
+            (j, c)
+            for c, camera in enumerate(dome.cameras)
+            for j in range(0, len(dome.lights), step)
+            if mergers[camera.id].dark is not None
         )
-        for light in dome.lights[:: -(-len(dome.lights) // MAX_PHOTOGRAPHS)]
-    ]
-    mean = np.mean(photographs, axis=0)
-    inner = mean[:, 1:-1]
-    chosen = inner <= np.quantile(inner, DARK_QUANTILE)
-    if chosen.sum() < MIN_PATTERN_PIXELS:
+        self._added = set[tuple[int, int]]()
+        self._total = dict[str, Float32]()
+        self._guard = threading.Lock()
+
+    def add(self, light: int, camera: int, frames: Sequence[Frame]) -> None:
+        """Add the exposures of one view, if it is one of `pairs`."""
+        if (light, camera) not in self.pairs:
+            return
+        name = self._dome.cameras[camera].id
+        frame = frames[self._shortest(name)]
+        # a sum of integers that single precision holds, in any order
+        photograph = frame[:: _pattern_step(frame)].astype(np.float32)
+        with self._guard:
+            self._added.add((light, camera))
+            self._total[name] = self._total.get(name, np.float32(0)) + photograph
+
+    def faults(self, views: Iterable[tuple[int, int]], pool: Executor) -> list[Fault]:
+        """Faults of dark frames that match the photographs of their camera only turned,
+        or are those of another camera.
+
+        Those of these views (light, camera) that were not added are read, in the
+        threads of a pool; those that neither were added nor are named are left out.
+
+        Raises
+        ------
+        InputError
+            If a photograph cannot be decoded.
+        """
+        for j, c in sorted(self.pairs.intersection(views) - self._added):
+            camera = self._dome.cameras[c]
+            self.add(j, c, read_view(self._dome, self._dome.lights[j].id, camera))
+        faults = pool.map(self._fault, self._total)
+        return [fault for fault in faults if fault is not None]
+
+    def _shortest(self, camera: str) -> int:
+        seconds = self._mergers[camera].seconds
+        return seconds.index(min(seconds))
+
+    def _fault(self, camera: str) -> Fault | None:
+        shortest = self._shortest(camera)
+        dark = self._mergers[camera].dark
+        assert dark is not None
+        cameras = [x.id for x in self._dome.cameras]
+        count = sum(cameras[c] == camera for _, c in self._added)
+        mean = self._total[camera] / np.float32(count)
+        chosen = np.zeros(mean.shape, bool)
+        inner = mean[:, 1:-1]
+        chosen[:, 1:-1] = inner <= np.quantile(inner, DARK_QUANTILE)
+        places = np.flatnonzero(chosen)
+        if len(places) < MIN_PATTERN_PIXELS:
+            return None
+        pattern = _pattern(mean, places)
+
+        def agreement(frame: Frame) -> float:
+            return correlation(pattern, _pattern(frame, places))
+
+        # neighbouring pixels may share noise, for example by the interpolation of colours
+        step = _pattern_step(dark[shortest])
+        thinned = dark[shortest, ::step]
+        unrelated = [
+            agreement(np.roll(thinned, (5 * i, 7 * i), axis=(0, 1)))
+            for i in range(1, SHIFTS + 1)
+        ]
+        spread = max(float(np.std(unrelated)), 1 / np.sqrt(len(pattern)))
+        minimum = max(
+            MIN_CORRELATION * spread, MIN_CORRELATION_RATIO * agreement(thinned)
+        )
+        for finding, frame in _alternatives(camera, self._mergers, shortest):
+            if agreement(frame[::step]) > minimum:
+                return Fault(
+                    f"{self._dome.file}[dark]",
+                    "dark frames must show the pattern of the sensor where the "
+                    "photographs show it",
+                    f"camera {camera}: {finding}",
+                    "write them like the photographs: in the same orientation, under "
+                    "the id of their camera",
+                )
         return None
-    pattern = _pattern(mean, chosen)
 
-    def agreement(frame: Frame) -> float:
-        return correlation(pattern, _pattern(frame, chosen))
 
-    # neighbouring pixels may share noise, for example by the interpolation of colours
-    thinned = dark[::step]
-    unrelated = [
-        agreement(np.roll(thinned, (5 * i, 7 * i), axis=(0, 1)))
-        for i in range(1, SHIFTS + 1)
-    ]
-    spread = max(float(np.std(unrelated)), 1 / np.sqrt(len(pattern)))
-    minimum = max(MIN_CORRELATION * spread, MIN_CORRELATION_RATIO * agreement(thinned))
-    for finding, frame in _alternatives(camera, mergers, shortest):
-        if agreement(frame[::step]) > minimum:
-            cure = (
-                "write them like the photographs: in the same orientation, under the "
-                "id of their camera"
-            )
-            return Fault(
-                f"{dome.file}[dark]",
-                "dark frames must show the pattern of the sensor where the photographs show it",
-                f"camera {camera}: {finding}",
-                cure,
-            )
-    return None
+def _pattern_step(frame: Frame) -> int:
+    """Distance of the rows of a frame that are compared."""
+    return int(np.ceil(frame.shape[0] * frame.shape[1] / MAX_PATTERN_PIXELS))
 
 
 def _alternatives(
@@ -512,11 +556,14 @@ def _alternatives(
             yield f"those of camera {name} match its photographs", other_dark[exposure]
 
 
-def _pattern(frame: Frame | Float32, chosen: Mask) -> Float32:
-    """Differences (n,) of chosen values (h, w - 2, 3) from both neighbours in their
-    row, without outliers.
+def _pattern(frame: Frame | Float32, places: Index) -> Float32:
+    """Differences (n,) of values (h, w, 3) at flat indices (n,) from both neighbours in
+    their row, without outliers.
     """
-    values = frame.astype(np.float32)
-    difference = (values[:, 1:-1] - (values[:, :-2] + values[:, 2:]) / 2)[chosen]
+    values = frame.reshape(-1)
+    left, middle, right = (
+        values[places + shift].astype(np.float32) for shift in (-3, 0, 3)
+    )
+    difference = middle - (left + right) / 2
     limit = MAX_PATTERN_DEVIATIONS * robust_deviation(difference)
     return np.clip(difference, -limit, limit)

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from skindb.calibration.frame_checks import (
     dark_faults,
     dark_notes,
-    dark_pattern_fault,
     level_notes,
     repeated_frame_faults,
 )
@@ -279,7 +278,8 @@ class _DomeStages:
         parameters = self.run.parameters
         method = parameters.visibility
         mergers = frame_mergers(self.dome, self.run.faults, self.run.digests)
-        self._check_dark_frames(mergers)
+        for merger in mergers.values():
+            self.run.faults += dark_faults(self.dome, merger)
         intensity, measured = self._intensity(mergers)
         scene = RayScene(surfels.position, surfels.faces)
         light_fraction = light_visibility(
@@ -432,21 +432,6 @@ class _DomeStages:
         self.run.summary |= {
             "samples": describe_samples(lumitexels, self.run.surfels, dome)
         }
-
-    def _check_dark_frames(self, mergers: Mapping[str, FrameMerger]) -> None:
-        for merger in mergers.values():
-            self.run.faults += dark_faults(self.dome, merger)
-        if self.run.faults:
-            return
-        patterns = attempt(
-            self.run.faults,
-            lambda: [
-                *self.pool.map(
-                    lambda name: dark_pattern_fault(self.dome, name, mergers), mergers
-                )
-            ],
-        )
-        self.run.faults += [fault for fault in patterns or [] if fault is not None]
 
     def _intensity(self, mergers: Mapping[str, FrameMerger]) -> tuple[Float64, bool]:
         """Intensities of the lights (light, 3), and whether they could be determined.

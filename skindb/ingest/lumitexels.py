@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.calibration._merge_kernels import OK, SATURATED
-from skindb.calibration.frame_checks import checked_view, highest_value
+from skindb.calibration.frame_checks import SensorPatterns, checked_view, highest_value
 from skindb.calibration.irradiance import light_falloff
 from skindb.calibration.radiance import (
     FrameMerger,
@@ -195,6 +195,7 @@ class Sampler:
     def __post_init__(self) -> None:
         self._levels = ViewLevels.empty(self.spool.done.shape)
         self._sampled = self.spool.done.copy()  # or found to be faulty
+        self._patterns = SensorPatterns(self.dome, self.mergers)
         cameras = enumerate(self.dome.cameras)
         call = partial(_camera_sampling, self.views)
         self._shots = list(self.pool.map(call, *zip(*cameras, strict=True)))
@@ -224,20 +225,24 @@ class Sampler:
         Parameters
         ----------
         check
-            Views of its pairs come first, and the calibration is checked by them.
+            Views of its pairs, and those that show the patterns of the sensors, come
+            first; the calibration and the dark frames are checked by them.
         refuse
             Whether a calibration that the photographs contradict is an error.
 
         Raises
         ------
         InputError
-            With every frame that cannot be decoded, or for a calibration that the
-            photographs contradict.
+            With every frame that cannot be decoded, or for dark frames or a calibration
+            that the photographs contradict.
         """
         calibration = None
         contradictions = list[Fault]()
         if check is not None:
             pictures = self.pictures(check, check.pairs)
+            self._sample(self._patterns.pairs)
+            done = zip(*np.nonzero(self.spool.done), strict=True)
+            self.faults += self._patterns.faults(done, self.pool)
             calibration = None if self.faults else check.evaluate(pictures)
         if calibration is not None and refuse:
             contradictions = calibration_faults(self.dome, calibration)
@@ -292,6 +297,7 @@ class Sampler:
         shot = self._shots[c]
         digests: Digests = {}
         frames = checked_view(self.dome, light.id, merger, digests=digests)
+        self._patterns.add(j, c, frames)
         surfels = shot.surfels & self.views.lit[:, j]
         is_kept = (j, c) in self.kept
         merged = _merged(

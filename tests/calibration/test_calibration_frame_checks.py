@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import imagecodecs
@@ -27,8 +28,8 @@ from sphere import (
 from spoil import D, P, edit, put
 
 from skindb.calibration.frame_checks import (
+    SensorPatterns,
     _finite_range,
-    dark_pattern_fault,
     highest_value,
     level_notes,
     view_faults,
@@ -590,11 +591,9 @@ def found(folder):
     faults = []
     mergers = frame_mergers(dome, faults)
     assert faults == []
-    return [
-        fault
-        for name in mergers
-        if (fault := dark_pattern_fault(dome, name, mergers)) is not None
-    ]
+    views = np.ndindex(len(dome.lights), len(dome.cameras))
+    with ThreadPoolExecutor(1) as pool:
+        return SensorPatterns(dome, mergers).faults(views, pool)
 
 
 @pytest.mark.parametrize(
@@ -606,7 +605,7 @@ def found(folder):
     ],
 )
 @pytest.mark.parametrize("kind", ["pixels", "grey", "hot pixels"])
-def test_dark_pattern_fault__turned_and_mirrored_dark_frames(
+def test_sensor_patterns__turned_and_mirrored_dark_frames(
     capture_folder, kind, change, said
 ):
     write_dark(capture_folder, kind=kind, change=change)
@@ -617,7 +616,7 @@ def test_dark_pattern_fault__turned_and_mirrored_dark_frames(
     ]
 
 
-def test_dark_pattern_fault__dark_frames_of_another_camera(capture_folder):
+def test_sensor_patterns__dark_frames_of_another_camera(capture_folder):
     write_dark(capture_folder, names={"c0": "c1", "c1": "c0"})
     assert [fault.found for fault in found(capture_folder)] == [
         "camera c0: those of camera c1 match its photographs",
@@ -626,12 +625,12 @@ def test_dark_pattern_fault__dark_frames_of_another_camera(capture_folder):
 
 
 @pytest.mark.parametrize("kind", ["pixels", "grey", "columns", "hot pixels"])
-def test_dark_pattern_fault__true_dark_frames_have_none(capture_folder, kind):
+def test_sensor_patterns__true_dark_frames_have_none(capture_folder, kind):
     write_dark(capture_folder, kind=kind)
     assert found(capture_folder) == []
 
 
-def test_dark_pattern_fault__one_frame_for_all_cameras_and_unrelated_ones_have_none(
+def test_sensor_patterns__one_frame_for_all_cameras_and_unrelated_ones_have_none(
     capture_folder,
 ):
     write_dark(capture_folder, names={"c0": "c1"})
