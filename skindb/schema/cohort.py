@@ -7,6 +7,7 @@ import uuid
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from types import NoneType
 from typing import Any, Protocol
 
 import numpy as np
@@ -38,6 +39,8 @@ COMPARED = (
 EVEN = ("even_reflection", "even_reflection_error")
 # attributes of models that cohorts name beside the parameters of the fit
 OF_MODEL = ("dictionary", "dictionary_digest", *EVEN)
+# coordinate -> parameter of the fit, or attribute of the model
+FIT_COORDS = {f"fit_{name}": name for name in (*COMPARED, *EVEN)}
 # columns of the catalogue and coordinates of cohorts that are no attributes
 COLUMN = re.compile(
     r"take|subject|condition|session|consent|outdated|(fit|status|attribute)_.*|(.*_)?(generation|created)",
@@ -118,24 +121,18 @@ def take_coords(
     fit
         Attributes of its model, if there is one.
     """
-    coords: dict[str, Any] = {"subject": str(attrs.get("subject", take))}
-    coords |= {
+    coords: dict[str, Any] = {
+        "subject": str(attrs.get("subject", take)),
         "condition": str(attrs.get("condition", "normal")),
         "session": attrs.get("session"),
     }
-    traits = {str(name): value for name, value in dict(attrs.get("traits", {})).items()}
-    coords |= {
-        attribute_name(name): value
-        for name, value in traits.items()
-        if not isinstance(value, dict | list)
-    }
+    for name, value in dict(attrs.get("traits", {})).items():
+        if not isinstance(value, (dict, list)):
+            coords[attribute_name(str(name))] = value
     if fit is not None:
-        parameters = {
-            **fit.get("parameters", {}),
-            **{name: fit.get(name) for name in OF_MODEL},
-        }
-        names = (*COMPARED, *EVEN)
-        coords |= {f"fit_{name}": parameters.get(name) for name in names}
+        parameters = fit.get("parameters", {})
+        for coordinate, name in FIT_COORDS.items():
+            coords[coordinate] = (fit if name in OF_MODEL else parameters).get(name)
     return coords
 
 
@@ -172,7 +169,8 @@ def combine(
     InputError
         For a variable that no take has.
     """
-    available = list(dict.fromkeys(name for part in parts for name in part.variables))
+    layouts = _different_layouts(parts)
+    available = list(dict.fromkeys(name for part in layouts for name in part.variables))
     chosen = available if variables is None else list(dict.fromkeys(variables))
     if unknown := [name for name in chosen if name not in available]:
         cure = f"choose from {', '.join(sorted(available)) or 'none'}"
@@ -180,18 +178,16 @@ def combine(
             Fault(f"variable {name}", "a cohort has it", "no take with it", cure)
             for name in unknown
         )
-    labels = _all_labels(parts, chosen)
+    labels = _all_labels(layouts, chosen)
     extent = {dim: len(values) for dim, values in labels.items()}
-    for part in parts:
-        for dim in {
-            dim
-            for name in part.variables
-            if name in chosen
-            for dim in VARIABLES[name].dims
-        } - set(labels):
+    for part in layouts:
+        for dim in _dims(part, chosen) - labels.keys():
             extent[dim] = max(extent.get(dim, 0), int(part.sizes[dim]))
     extent |= {dim: size for dim, size in (sizes or {}).items() if dim in extent}
-    arrays = {name: _lazy(name, parts, extent, labels) for name in chosen}
+    arrays = {
+        name: _lazy(name, _sources(name, parts, layouts), extent, labels)
+        for name in chosen
+    }
     coords: dict[Hashable, Any] = {
         dim: text_labels(values) for dim, values in labels.items()
     }
@@ -207,32 +203,22 @@ def column(values: Sequence[Any]) -> NDArray[Any]:
     """Values of one attribute of takes as an array of numbers, truth values or text;
     NaN where it is missing.
     """
-    numbers = [value for value in values if value is not None]
-    is_complete = len(numbers) == len(values)
-    if numbers and all(isinstance(value, bool) for value in numbers):
-        return (
-            np.array(values, bool)
-            if is_complete
-            else np.array([np.nan if v is None else v for v in values], object)
-        )
-    if numbers and all(
-        isinstance(value, int | float) and not isinstance(value, bool)
-        for value in numbers
-    ):
-        dtype = (
-            np.int64
-            if is_complete and all(isinstance(value, int) for value in numbers)
-            else np.float64
-        )
-        return np.array([np.nan if value is None else value for value in values], dtype)
-    # numbers and words: each stays what it is
-    if any(isinstance(value, int | float) for value in numbers):
-        return np.array(
-            [np.nan if value is None else value for value in values], object
-        )
-    return np.array(
-        [np.nan if value is None else str(value) for value in values], object
-    )
+    types = {*map(type, values)}
+    is_complete = NoneType not in types
+    types.discard(NoneType)
+    truths = {one for one in types if issubclass(one, bool)}
+    numbers = {one for one in types if issubclass(one, (int, float))}
+    if types and types == truths and is_complete:
+        return np.array(values, bool)
+    if not numbers:
+        text = [np.nan if value is None else str(value) for value in values]
+        return np.array(text, object)
+    known = [np.nan if value is None else value for value in values]
+    if types != numbers or truths:
+        # numbers and words: each stays what it is
+        return np.array(known, object)
+    is_whole = is_complete and all(issubclass(one, int) for one in types)
+    return np.array(known, np.int64 if is_whole else np.float64)
 
 
 def one_take_each(cohort: xr.Dataset) -> xr.Dataset:
@@ -324,15 +310,33 @@ def _all_labels(
     """Dim -> the labels of all takes, in the order in which they are met."""
     labels: dict[str, dict[Any, None]] = {}
     for part in parts:
-        dims = {
-            dim
-            for name in part.variables
-            if name in variables
-            for dim in VARIABLES[name].dims
-        }
-        for dim in sorted(dims & part.labels.keys()):
+        for dim in sorted(_dims(part, variables) & part.labels.keys()):
             labels.setdefault(dim, {}).update(dict.fromkeys(part.labels[dim]))
     return {dim: list(values) for dim, values in labels.items()}
+
+
+def _different_layouts(parts: Sequence[Part]) -> list[Part]:
+    """One part of each layout; parts of a large cohort share the objects that describe it."""
+    layouts: dict[tuple[int, int, int], Part] = {}
+    for part in parts:
+        key = (id(part.variables), id(part.sizes), id(part.labels))
+        layouts.setdefault(key, part)
+    return [*layouts.values()]
+
+
+def _sources(
+    name: str, parts: Iterable[Part], layouts: Iterable[Part]
+) -> list[Source | None]:
+    """Source of a variable for each part; None if it lacks the variable."""
+    if all(name in part.variables for part in layouts):
+        return [part.source for part in parts]
+    return [part.source if name in part.variables else None for part in parts]
+
+
+def _dims(part: Part, variables: Sequence[str]) -> set[str]:
+    """Dims of those of these variables that a part has."""
+    names = {*part.variables}.intersection(variables)
+    return {dim for name in names for dim in VARIABLES[name].dims}
 
 
 @dataclass(frozen=True)
@@ -396,7 +400,7 @@ def selected(values: NDArray[Any], key: Sequence[Any]) -> NDArray[Any]:
 
 def _lazy(
     name: str,
-    parts: Sequence[Part],
+    sources: Iterable[Source | None],
     extent: Mapping[str, int],
     labels: Mapping[str, Sequence[Any]],
 ) -> xr.Variable:
@@ -407,7 +411,7 @@ def _lazy(
     dims = VARIABLES[name].dims
     stack = Stack(
         name,
-        tuple(part.source if name in part.variables else None for part in parts),
+        tuple(sources),
         tuple(extent[dim] for dim in dims),
         {
             dim: {value: i for i, value in enumerate(labels[dim])}

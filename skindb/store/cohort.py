@@ -22,6 +22,7 @@ from skindb.schema.cohort import (
 )
 from skindb.schema.notes import Note, note, note_lines
 from skindb.store.arrays import open_group
+from skindb.store.entries import collection_paused
 from skindb.store.gathered import (
     Address,
     StoredTables,
@@ -38,6 +39,11 @@ Layout = Literal["tables", "surfels", "maps"]
 GROUP: dict[str, str] = {"tables": "tables", "surfels": "sample", "maps": "maps"}
 SAMPLES = "reflectance_sample"
 DOME = ("light_position", "camera_position")
+DOME_DIMS = ("light", "camera", "channel", "xyz")
+Contents = Mapping[str, Any]  # description of a group in a record
+NO_CONTENTS: Contents = {"variables": [], "sizes": {}, "labels": {}}
+# variables, sizes and labels of a part
+Layouts = tuple[Sequence[str], Mapping[str, int], Mapping[str, Sequence[Any]]]
 # cached by a process; open groups hold no values
 MAX_OPEN_GROUPS = 512
 
@@ -96,6 +102,7 @@ class StoredSamples:
         return values.isel(surfel=np.argsort(order)).assign_coords(labels)
 
 
+@collection_paused()
 def cohort(
     lookup: Lookup,
     request: CohortRequest,
@@ -123,13 +130,10 @@ def cohort(
     names, skipped = _members(lookup, base, takes)
     records = {take: lookup.record(base, take) for take in names}
     stored = _stored_records(lookup, records, request)
-    parts = [
-        _part(lookup, records[take], version, request, chosen)
-        for take, version in stored.items()
-    ]
+    parts = _parts(lookup, stored, request, chosen)
     if layout == "tables" and len(parts) > FEW_TAKES:
-        addresses = [Address.of(lookup.place, version) for version in stored.values()]
-        sources = table_sources(addresses)
+        url = lookup.place.address()
+        sources = table_sources(Address.of(url, version) for version in stored.values())
         parts = [
             replace(part, source=source)
             for part, source in zip(parts, sources, strict=True)
@@ -142,7 +146,7 @@ def cohort(
         parts = [part for part in parts if part.take not in empty]
         skipped += [note(take, "none of its surfels was fitted") for take in empty]
     if layout == "surfels" and chosen is None and not _have_same_dome(parts):
-        parts = [_without_variables(part, (SAMPLES, *DOME)) for part in parts]
+        parts = _without_samples(parts)
     sizes = {"surfel": request.surfels} if layout == "surfels" else {}
     attrs = {
         "layout": layout,
@@ -229,7 +233,7 @@ def _members(
     """Takes that the cohort may use, and one note for each skipped take."""
     available = sorted(lookup.takes(kind))
     names = available if takes is None else list(dict.fromkeys(takes))
-    if unknown := [take for take in names if not lookup.has(kind, take)]:
+    if unknown := [take for take in takes or () if not lookup.has(kind, take)]:
         rule = f"every take of a cohort must have a {kind}"
         cure = f"takes with one: {', '.join(available) or 'none'}"
         raise InputError(Fault(take, rule, "none", cure) for take in unknown)
@@ -358,36 +362,52 @@ def _has_data_for(record: Record, request: CohortRequest) -> bool:
     return request.layout == "tables" or contents["sizes"]["u"] == request.size
 
 
-def _part(
+def _parts(
     lookup: Lookup,
-    record: Record,
-    stored: Record,
+    stored: Mapping[str, Record],
     request: CohortRequest,
     chosen: Sequence[str] | None,
-) -> Part:
-    layout = request.layout
-    address = Address.of(lookup.place, stored)
-    contents = stored.contents.get(
-        GROUP[layout], {"variables": [], "sizes": {}, "labels": {}}
+) -> list[Part]:
+    """The part of each take, from the version with its data."""
+    url = lookup.place.address()
+    needs_samples = request.layout == "surfels" and (
+        chosen is None or not {SAMPLES, *DOME}.isdisjoint(chosen)
     )
+    # identities of the contents of a version and of its capture, which thousands of
+    # takes share -> these, and the layout
+    layouts: dict[tuple[int, int], tuple[Contents, Contents, Layouts]] = {}
+    parts = []
+    for take, version in stored.items():
+        address = Address.of(url, version)
+        contents = version.contents.get(GROUP[request.layout], NO_CONTENTS)
+        dome = NO_CONTENTS
+        source: Source = StoredTables(address)
+        if request.layout != "tables":
+            source = StoredGroup(address, GROUP[request.layout])
+        if needs_samples and "surfel_index" in contents["variables"]:
+            capture = _capture_of(lookup, lookup.record("model", take))
+            if capture is not None:
+                dome = capture.contents["dome"]
+                captured = Address.of(url, capture)
+                source = StoredSamples(address, captured, request.surfels)
+        key = (id(contents), id(dome))
+        if key not in layouts:
+            layouts[key] = (contents, dome, _layout(contents, dome))
+        parts.append(Part(take, _coords(lookup, take), *layouts[key][2], source))
+    return parts
+
+
+def _layout(contents: Contents, dome: Contents) -> Layouts:
+    """Variables, sizes and labels of a part, with the samples if there is a dome."""
     variables = list(contents["variables"])
-    sizes = dict(contents["sizes"])
-    labels = dict(contents["labels"])
-    coords = _coords(lookup, record.take)
-    source: Source = StoredTables(address)
-    if layout != "tables":
-        source = StoredGroup(address, GROUP[layout])
-    needs_samples = chosen is None or bool({SAMPLES, *DOME} & set(chosen))
-    if layout == "surfels" and "surfel_index" in variables and needs_samples:
-        capture = _capture_of(lookup, lookup.record("model", record.take))
-        if capture is not None:
-            dome_sizes, dome_labels = _dome(capture)
-            variables += [SAMPLES, *DOME]
-            sizes |= dome_sizes
-            labels |= dome_labels
-            capture_address = Address.of(lookup.place, capture)
-            source = StoredSamples(address, capture_address, request.surfels)
-    return Part(record.take, coords, variables, sizes, labels, source)
+    if dome is NO_CONTENTS:
+        return variables, contents["sizes"], contents["labels"]
+    sizes, labels = (
+        {dim: dome[name][dim] for dim in DOME_DIMS if dim in dome[name]}
+        for name in ("sizes", "labels")
+    )
+    variables += [SAMPLES, *DOME]
+    return variables, contents["sizes"] | sizes, contents["labels"] | labels
 
 
 def _capture_of(lookup: Lookup, model: Record) -> Record | None:
@@ -404,17 +424,6 @@ def _capture_of(lookup: Lookup, model: Record) -> Record | None:
     return None
 
 
-def _dome(capture: Record) -> tuple[dict[str, int], dict[str, list[Any]]]:
-    """Sizes and labels of the lights, cameras and channels of a capture."""
-    contents = capture.contents
-    sizes = contents["dome"]["sizes"]
-    labels = contents["dome"]["labels"]
-    dims = ("light", "camera", "channel", "xyz")
-    return {d: sizes[d] for d in dims if d in sizes}, {
-        d: labels[d] for d in dims if d in labels
-    }
-
-
 def _have_same_dome(parts: Sequence[Part]) -> bool:
     """Whether all takes were measured under the same lights by the same cameras."""
     domes = [(part.labels.get("light"), part.labels.get("camera")) for part in parts]
@@ -423,9 +432,15 @@ def _have_same_dome(parts: Sequence[Part]) -> bool:
     )
 
 
-def _without_variables(part: Part, names: Iterable[str]) -> Part:
-    remaining = [name for name in part.variables if name not in set(names)]
-    return Part(part.take, part.coords, remaining, part.sizes, part.labels, part.source)
+def _without_samples(parts: Sequence[Part]) -> list[Part]:
+    """The parts without the reflectance samples and the dome; those with the same
+    variables share them again.
+    """
+    remaining = {
+        id(part.variables): [v for v in part.variables if v not in (SAMPLES, *DOME)]
+        for part in parts
+    }
+    return [replace(part, variables=remaining[id(part.variables)]) for part in parts]
 
 
 @lru_cache(MAX_OPEN_GROUPS)

@@ -7,11 +7,13 @@ few blocks. No lock is needed, as by SQLite on a folder that machines share: an 
 counts only while the files that it was read from are the same.
 """
 
+import gc
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -78,6 +80,20 @@ class Entry:
     # identity of the head when the record was the newest; empty without a head, None if
     # not read
     head: str | None
+
+
+@contextmanager
+def collection_paused() -> Iterator[None]:
+    """Context without garbage collections, a quarter of the time in which the objects of
+    ten thousand takes are made, all of which remain.
+    """
+    is_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if is_enabled:
+            gc.enable()
 
 
 def key_of(record: Record) -> Key:

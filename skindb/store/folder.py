@@ -6,7 +6,7 @@ import shutil
 import stat
 import sys
 import uuid
-from collections.abc import Callable, Hashable, Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterable
 from contextlib import suppress
 from functools import partial
 from io import BufferedReader
@@ -111,11 +111,8 @@ class Folder:
         Empty folders, and folders nested deeper than those of zarr, are listed with -1.
         """
         place = inside(self.root, key)
-        return (
-            {name: identity[0] for name, identity in _walk(place, "", MAX_FOLDER_DEPTH)}
-            if place.is_dir()
-            else {}
-        )
+        files = _walk(place) if place.is_dir() else {}
+        return {name: identity[0] for name, identity in files.items()}
 
     def read(self, key: str, begin: int = 0, end: int | None = None) -> bytes:
         """Contents of a file from byte `begin`, counted from its end if negative, up to `end`."""
@@ -140,7 +137,7 @@ class Folder:
         (-1,) where `sizes` returns -1.
         """
         place = inside(self.root, key)
-        return dict(_walk(place, "", MAX_FOLDER_DEPTH)) if place.is_dir() else {}
+        return {**_walk(place)} if place.is_dir() else {}
 
     def proves(self, identity: tuple[Hashable, ...], content: bytes) -> bool:  # noqa: ARG002
         """False: the identity of a local file does not show its content."""
@@ -342,22 +339,24 @@ def _identity(status: os.stat_result) -> tuple[int, ...]:
 
 
 def _walk(
-    place: str | Path, prefix: str, depth: int
-) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Path and identity of every file; (-1,) if it is not a regular file. What is
+    place: str | Path, prefix: str = "", depth: int = MAX_FOLDER_DEPTH
+) -> dict[str, tuple[int, ...]]:
+    """Identity of every file by its path; (-1,) if it is not a regular file. What is
     removed meanwhile is not listed.
     """
+    files: dict[str, tuple[int, ...]] = {}
     entries = _entries(place)
     if entries == [] and prefix:  # zarr creates no empty folders
-        yield prefix.rstrip("/"), (-1,)
+        files[prefix.rstrip("/")] = (-1,)
     for entry in entries or []:
         name = f"{prefix}{entry.name}"
         if depth and entry.is_dir(follow_symlinks=False):
-            yield from _walk(entry.path, f"{name}/", depth - 1)
+            files |= _walk(entry.path, f"{name}/", depth - 1)
             continue
         with suppress(FileNotFoundError):
             status = entry.stat(follow_symlinks=False)
-            yield name, _identity(status) if stat.S_ISREG(status.st_mode) else (-1,)
+            files[name] = _identity(status) if stat.S_ISREG(status.st_mode) else (-1,)
+    return files
 
 
 def _entries(place: str | Path) -> list[os.DirEntry[str]] | None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
@@ -53,9 +53,8 @@ class Address:
     seal: str
 
     @classmethod
-    def of(cls, place: Place, record: Record) -> Address:
-        """The address of the version of a record."""
-        url = place.address()
+    def of(cls, url: str, record: Record) -> Address:
+        """The address of the version of a record in the database at `Place.address`."""
         return cls(url, record.kind, record.take, record.generation, record.seal)
 
     @property
@@ -100,11 +99,12 @@ class StoredTables:
         return _opened(self.block)[name][self.index]
 
 
-def table_sources(addresses: Sequence[Address]) -> list[StoredTables]:
+def table_sources(addresses: Iterable[Address]) -> list[StoredTables]:
     """Sources of the tables of takes, which share blocks."""
+    listed = tuple(addresses)
     sources = []
-    for start in range(0, len(addresses), GATHERED_TAKES):
-        part = tuple(addresses[start : start + GATHERED_TAKES])
+    for start in range(0, len(listed), GATHERED_TAKES):
+        part = listed[start : start + GATHERED_TAKES]
         seals = "\n".join(one.seal for one in part)
         digest = hashlib.sha256(seals.encode()).hexdigest()
         block = Block(f"{GATHERED}/{digest}.npz", part)

@@ -8,6 +8,7 @@ the newest record, the same head. All other listed records are read and checked 
 from __future__ import annotations
 
 import re
+from bisect import insort
 from collections.abc import Hashable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -20,6 +21,7 @@ from skindb.store.entries import (
     Entry,
     Key,
     blocks_to_merge,
+    collection_paused,
     key_of,
     read_blocks,
     trimmed_record,
@@ -261,8 +263,8 @@ def list_records(place: Place, kind: str = "") -> dict[tuple[str, str, int], str
 
 
 def identity_text(identity: tuple[Hashable, ...]) -> str:
-    """Identity of a file as text."""
-    return " ".join(map(str, identity))
+    """Identity of a file as text; empty if there is none."""
+    return str(identity) if identity else ""
 
 
 def consent_of(records: Records, take: str) -> tuple[str, ...]:
@@ -320,6 +322,7 @@ class RecordCache:
         Location of the database.
     """
 
+    @collection_paused()
     def __init__(self, place: Place) -> None:
         self.place = place
         with ThreadPoolExecutor(4) as pool:
@@ -331,6 +334,9 @@ class RecordCache:
         self._heads = heads.result()
         self._markers = markers.result()
         self.snapshot = Snapshot(place, self._markers)
+        self._head_texts = {
+            key: identity_text(identity) for key, identity in self._heads.items()
+        }
         self._entries: dict[Key, Entry] = {}
         # key of each block -> its entries that are still valid; none if it is damaged
         self._blocks = {
@@ -338,7 +344,13 @@ class RecordCache:
             for key, entries in blocks.result().items()
         }
         self._new: set[Key] = set()  # entries that no block holds
-        self._generations = _generations(self._files)
+        # kind and take -> generations in ascending order
+        self._generations: dict[tuple[str, str], list[int]] = {}
+        for kind, take, generation in self._files:
+            insort(self._generations.setdefault((kind, take), []), generation)
+        self._named: dict[str, set[str]] = {}  # kind -> takes with a record or a head
+        for kind, take in (*self._generations, *self._heads):
+            self._named.setdefault(kind, set()).add(take)
 
     def _add_entries(self, entries: Iterable[Entry]) -> list[Key]:
         """Add the entries of a block whose files have not changed."""
@@ -347,24 +359,20 @@ class RecordCache:
             key = key_of(entry.record)
             if self._files.get(key) == entry.file:
                 added.append(key)
-                if key not in self._entries or entry.head == self._head_text(*key[:2]):
+                head = self._head_texts.get(key[:2], "")
+                if key not in self._entries or entry.head == head:
                     self._entries[key] = entry
         return added
 
     def kinds(self) -> list[str]:
         """Kinds of the versions of all takes, without the transient kinds."""
-        named = sorted(
-            {kind for kind, _ in {*self._generations, *self._heads}} - {*TRANSIENT}
-        )
+        named = sorted(self._named.keys() - {*TRANSIENT})
         return [kind for kind in named if re.fullmatch(KIND, kind) and self.takes(kind)]
 
     def takes(self, kind: str) -> list[str]:
         """Takes with a version of this kind, including those whose records were lost."""
-        return sorted(
-            take
-            for listed_kind, take in {*self._generations, *self._heads}
-            if listed_kind == kind and self.has(kind, take)
-        )
+        named = self._named.get(kind, ())
+        return sorted(take for take in named if self.has(kind, take))
 
     def has(self, kind: str, take: str) -> bool:
         """Whether a take has a version of this kind."""
@@ -447,12 +455,9 @@ class RecordCache:
         number = generation if generation is not None or not listed else listed[-1]
         entry = None if number is None else self._entries.get((kind, take, number))
         is_checked = generation is not None or (
-            entry is not None and entry.head == self._head_text(kind, take)
+            entry is not None and entry.head == self._head_texts.get((kind, take), "")
         )
         return entry if is_checked else None
-
-    def _head_text(self, kind: str, take: str) -> str:
-        return identity_text(self._heads.get((kind, take), ()))
 
     def _read(self, kind: str, take: str, generation: int | None) -> Record:
         """A record from the log, with the checks of `Log.read`."""
@@ -480,7 +485,7 @@ class RecordCache:
             self._entries[key] = Entry(
                 record,
                 self._files[key],
-                self._head_text(kind, take) if generation is None else None,
+                self._head_texts.get((kind, take), "") if generation is None else None,
             )
             self._new.add(key)
         return record
@@ -500,14 +505,6 @@ def require_same_markers(place: Place, markers: Markers, key: str) -> None:
                 "run the command again",
             )
         )
-
-
-def _generations(files: Iterable[Key]) -> dict[tuple[str, str], list[int]]:
-    """Generations in ascending order, by kind and take."""
-    generations: dict[tuple[str, str], list[int]] = {}
-    for kind, take, generation in sorted(files):
-        generations.setdefault((kind, take), []).append(generation)
-    return generations
 
 
 def _list_heads(place: Place) -> dict[tuple[str, str], tuple[Hashable, ...]]:

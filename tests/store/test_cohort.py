@@ -341,7 +341,7 @@ def test_cohort__groups_that_stay_open_hold_no_values(db):
     ).load()
     take = str(cohort["take"].values[0])
     record = db.record("model", take)
-    opened = _group(Address.of(db.place, record), "sample")
+    opened = _group(Address.of(db.place.address(), record), "sample")
     assert "diffuse_reflectance" in opened
     assert [
         name

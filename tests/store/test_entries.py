@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+from contextlib import suppress
 from unittest import mock
 
 import pytest
@@ -77,3 +79,16 @@ def test_read_blocks__that_another_query_merges_meanwhile(db):
     with mock.patch.object(entries, "block_keys", side_effect=listings):
         [rows] = entries.read_blocks(db.place).values()
     assert [row.record.take for row in rows] == ["A1", "B2", "C3", "D4"]
+
+
+@pytest.mark.parametrize("is_enabled", [True, False])
+def test_collection_paused__leaves_the_state_of_the_process(is_enabled):
+    was_enabled = gc.isenabled()
+    (gc.enable if is_enabled else gc.disable)()
+    try:
+        with suppress(ValueError), entries.collection_paused():
+            assert not gc.isenabled()
+            raise ValueError
+        assert gc.isenabled() == is_enabled
+    finally:
+        (gc.enable if was_enabled else gc.disable)()
