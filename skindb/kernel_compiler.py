@@ -65,7 +65,10 @@ class LinkedCompiler(Compiler):  # type: ignore[misc]
 
 
 class LinkedLibrary(JITCodeLibrary):  # type: ignore[misc]
-    """Code of LLVM that becomes a part of others."""
+    """Code of LLVM that becomes a part of others, and is optimised there."""
+
+    def _optimize_final_module(self) -> None:
+        pass
 
     def _finalize_final_module(self) -> None:
         self._finalize_dynamic_globals()
