@@ -116,7 +116,7 @@ def open_version(place: Place, record: Record) -> xr.DataTree:
     """
     store = VerifiedStore(place, record)
     # chunks={} would use the inner chunks, which gives sixteen times as many tasks
-    tree = xr.open_datatree(store, engine="zarr", consolidated=False, chunks=None)  # type: ignore[arg-type]
+    tree = xr.open_datatree(store, engine="zarr", consolidated=True, chunks=None)  # type: ignore[arg-type]
     groups = {
         path: _lazy(store, path.strip("/"), node.to_dataset(inherit=False))
         for path, node in tree.subtree_with_keys
@@ -129,7 +129,7 @@ def open_version(place: Place, record: Record) -> xr.DataTree:
 def open_group(place: Place, record: Record, group: str) -> xr.Dataset:
     """One group of a version, without opening the others."""
     store: Any = VerifiedStore(place, record)
-    options: dict[str, Any] = {"engine": "zarr", "consolidated": False, "chunks": None}
+    options: dict[str, Any] = {"engine": "zarr", "consolidated": True, "chunks": None}
     return _lazy(store, group, xr.open_dataset(store, group=group, **options))
 
 

@@ -1,9 +1,8 @@
 """An S3 bucket as the location of a database: one object for each file.
 
 An object is written in one request, so that it is either complete or absent. The many
-small zarr.json files of a version are written when it is committed and cached when they
-are read: zarr requests each of them several times, and a request takes as long for 500
-bytes as for 500,000.
+small zarr.json files of a version, each of which zarr changes several times, are written
+when it is committed.
 """
 
 from __future__ import annotations
@@ -52,7 +51,6 @@ T = TypeVar("T")
 # before a request is repeated whose answer was lost and that obstore does not repeat
 PAUSES_S = (0.2, 1.0, 5.0)
 METADATA = "/zarr.json"
-MAX_CACHED_METADATA = 20_000  # number of zarr.json objects, some 20 MB
 THREADS = 16  # write zarr.json objects in parallel
 FETCH_BYTES = 1 << 23  # read at a time while a digest is computed
 
@@ -75,7 +73,6 @@ class Bucket:
         # whether the server is known to refuse to overwrite
         self._is_conditional = False
         self._pending: dict[str, bytes] = {}  # metadata that are not written yet
-        self._kept: dict[str, bytes] = {}  # metadata that were read, which never change
         # key -> digests and entity tag of an object that this process wrote
         self._written: dict[str, tuple[Digests, str]] = {}
 
@@ -168,8 +165,8 @@ class Bucket:
         to `end`.
         """
         path = self._path(key)
-        if path.endswith(METADATA) and not begin and end is None:
-            return self._metadata(path)
+        if path in self._pending and not begin and end is None:
+            return self._pending[path]
         if end is not None and end <= begin:
             return b""
         if end is not None:
@@ -364,7 +361,7 @@ class Bucket:
                 [path, *(f"{path}/{name}" for name in self._objects(key))]
             ),
         )
-        for cache in (self._pending, self._kept, self._written):
+        for cache in (self._pending, self._written):
             for name in [
                 name
                 for name in list(cache)
@@ -393,17 +390,6 @@ class Bucket:
         path = self._path(key)
         tag = self._put(path, data)
         self._written[path] = digests_of([data]), tag
-
-    def _metadata(self, path: str) -> bytes:
-        """Contents of a zarr.json object, which is requested only once."""
-        cached = self._pending.get(path) or self._kept.get(path)
-        if cached is not None:
-            return cached
-        data = self._ask(path, lambda: bytes(self._store.get(path).bytes()))
-        if len(self._kept) >= MAX_CACHED_METADATA:
-            self._kept.clear()
-        self._kept[path] = data
-        return data
 
     def _put_new(self, path: str, data: bytes) -> bool:
         """Write an object by a conditional put; False if one exists."""

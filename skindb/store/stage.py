@@ -218,7 +218,7 @@ class Stage:
             **plain(dict(provenance)),
         }
         with add_filename(self.place.where(self.path)):
-            self._write_root(attrs)
+            self._write_metadata(attrs)
             # the data first, then the record; transient results need not survive a power loss
             self.place.make_durable(self.path, flush=self.log.kind not in TRANSIENT)
         files = self._written_files()
@@ -249,27 +249,33 @@ class Stage:
         self.committed = True
         return record
 
-    def _write_root(self, attrs: Mapping[str, Any]) -> None:
-        """Write the metadata of the root with those of all nodes, so that other programs
-        open a version by one file; `zarr.consolidate_metadata` would warn about format 3.
+    def _write_metadata(self, attrs: Mapping[str, Any]) -> None:
+        """Write the metadata of the root and of each group with those of all nodes below
+        it, so that a reader opens it by one file; `zarr.consolidate_metadata` would warn
+        about format 3.
         """
-        nodes = {}
+        nodes: dict[str, dict[str, Any]] = {}
         for node in sorted(self._nodes, key=lambda name: (name.count("/"), name)):
             with suppress(OSError):  # `_written_files` reports a missing one
                 content = self.place.read(f"{self.path}/{node}/zarr.json")
                 nodes[node] = json.loads(content)
-        root = {
-            "zarr_format": 3,
-            "node_type": "group",
-            "attributes": attrs,
-            "consolidated_metadata": {
+        store = self.place.writable(self.path)
+        root = {"zarr_format": 3, "node_type": "group", "attributes": attrs}
+        groups = {f"{name}/": nodes[name] for name in self.groups & nodes.keys()}
+        for path, group in {**groups, "": root}.items():
+            below = {
+                name.removeprefix(path): node
+                for name, node in nodes.items()
+                if name.startswith(path)
+            }
+            consolidated = {
                 "kind": "inline",
                 "must_understand": False,
-                "metadata": nodes,
-            },
-        }
-        buffer = default_buffer_prototype().buffer.from_bytes(json.dumps(root).encode())
-        sync(self.place.writable(self.path).set("zarr.json", buffer))
+                "metadata": below,
+            }
+            text = json.dumps({**group, "consolidated_metadata": consolidated})
+            buffer = default_buffer_prototype().buffer.from_bytes(text.encode())
+            sync(store.set(f"{path}zarr.json", buffer))
 
     def _written_files(self) -> Manifest:
         """Size and digests of every file, with those of all groups that were written."""

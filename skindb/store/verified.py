@@ -7,7 +7,7 @@ import hashlib
 import math
 import re
 from collections import Counter
-from collections.abc import AsyncIterator, Iterable
+from collections.abc import AsyncIterator, Iterable, Mapping
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -243,7 +243,8 @@ class VerifiedStore(ListedStore):
 
     def _require_plausible(self, key: str, content: bytes) -> None:
         """Raise an `InputError` for metadata that do not match the chunk files."""
-        if finding := metadata_faults(content, self._chunks[key.rpartition("/")[0]]):
+        node = key.removesuffix("zarr.json").rstrip("/")
+        if finding := metadata_fault(content, node, self._chunks):
             location = self.place.where(f"{self.record.path}/{key}")
             raise input_error(
                 location,
@@ -291,38 +292,53 @@ def limits(byte_range: Any) -> tuple[int, int | None]:
     return -byte_range.suffix, None
 
 
-def metadata_faults(content: bytes, chunks: int) -> str:
+def metadata_fault(content: bytes, node: str, chunks: Mapping[str, int]) -> str:
     """Description of what is wrong with a committed zarr.json; empty if it is valid.
 
     Parameters
     ----------
     content
-        Content of the file.
+        Content of the file, which may hold the metadata of the nodes below it, too.
+    node
+        Path of its group or array.
     chunks
-        Number of chunk files of the array; skindb writes every chunk, including those
-        that contain only zeros.
+        Path of an array -> number of its chunk files; skindb writes every chunk,
+        including those that contain only zeros.
     """
     try:
         meta = json_object(content)
-        if meta.get("node_type") != "array":
-            return ""
-        dtype = meta["data_type"]
-        if not isinstance(dtype, str) or dtype not in DTYPES:
-            return f"elements of the type {str(dtype)[:80]}"
-        shape = _lengths(meta["shape"])
-        chunk = _lengths(meta["chunk_grid"]["configuration"]["chunk_shape"])
-        if len(shape) != len(chunk) or len(shape) > MAX_DIMS or 0 in chunk:
-            return f"a shape {list(shape)} with chunks {list(chunk)}"
-        if (size := math.prod(chunk) * DTYPES[dtype]) > MAX_CHUNK_BYTES:
-            return f"chunks of {size:.3g} bytes, more than the maximum of {MAX_CHUNK_BYTES:.3g}"
-        promised = math.prod(
-            -(-length // part) for length, part in zip(shape, chunk, strict=True)
+        below = meta.get("consolidated_metadata", {"metadata": {}})["metadata"]
+        nodes = {
+            node: meta,
+            **{f"{node}/{name}": value for name, value in below.items()},
+        }
+        faults = (
+            _node_fault(one, chunks[path.strip("/")]) for path, one in nodes.items()
         )
-        if promised != chunks:
-            return f"a shape {list(shape)} with {promised} chunks, but {chunks} chunk files"
-        return _codec_faults(meta["codecs"], depth=0)
+        return next(filter(None, faults), "")
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         return f"invalid metadata ({type(error).__name__}: {error})"
+
+
+def _node_fault(meta: dict[str, Any], chunks: int) -> str:
+    """What is wrong with the metadata of a group, or of an array with so many chunk files."""
+    if meta.get("node_type") != "array":
+        return ""
+    dtype = meta["data_type"]
+    if not isinstance(dtype, str) or dtype not in DTYPES:
+        return f"elements of the type {str(dtype)[:80]}"
+    shape = _lengths(meta["shape"])
+    chunk = _lengths(meta["chunk_grid"]["configuration"]["chunk_shape"])
+    if len(shape) != len(chunk) or len(shape) > MAX_DIMS or 0 in chunk:
+        return f"a shape {list(shape)} with chunks {list(chunk)}"
+    if (size := math.prod(chunk) * DTYPES[dtype]) > MAX_CHUNK_BYTES:
+        return f"chunks of {size:.3g} bytes, more than the maximum of {MAX_CHUNK_BYTES:.3g}"
+    promised = math.prod(
+        -(-length // part) for length, part in zip(shape, chunk, strict=True)
+    )
+    if promised != chunks:
+        return f"a shape {list(shape)} with {promised} chunks, but {chunks} chunk files"
+    return _codec_faults(meta["codecs"], depth=0)
 
 
 def _codec_faults(codecs: list[dict[str, Any]], depth: int) -> str:

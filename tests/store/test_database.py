@@ -169,6 +169,8 @@ def test_stage__other_programs_open_a_version_without_a_warning(tmp_path):
     consolidated = root.metadata.consolidated_metadata.flattened_metadata
     members = dict(root.members(max_depth=None, use_consolidated_for_children=False))
     assert consolidated.keys() == members.keys()
+    group = xr.open_zarr(tmp_path / record.path, group="samples")
+    assert group["reflectance_sample"].shape == (10, 3, 2, 3)
 
 
 def test_stage__large_arrays_are_written_shard_by_shard(tmp_path, monkeypatch):

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import resource
+from collections import Counter
 
 import pytest
 from stored import commit, groups
 
 from skindb.errors import InputError
 from skindb.store import Database
-from skindb.store.verified import metadata_faults
+from skindb.store.verified import array_of, metadata_fault
 
 AREA = "surfels/surfel_area/zarr.json"
 
@@ -107,16 +108,14 @@ def test_read__metadata_that_promise_too_much_are_refused_before_allocation(
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000  # kB
 
 
-def test_metadata_faults__none_in_what_skindb_writes(tmp_path):
+def test_metadata_fault__none_in_what_skindb_writes(tmp_path):
     record = commit(tmp_path)
     files = json.loads((tmp_path / record.beside("manifest")).read_text())
+    chunks = Counter(map(array_of, files))
     for name in [name for name in files if name.endswith("zarr.json")]:
-        chunks = sum(
-            one.startswith(name.removesuffix("zarr.json") + "c") for one in files
-        )
-        assert (
-            metadata_faults((tmp_path / record.path / name).read_bytes(), chunks) == ""
-        )
+        content = (tmp_path / record.path / name).read_bytes()
+        node = name.removesuffix("zarr.json").rstrip("/")
+        assert metadata_fault(content, node, chunks) == ""
 
 
 @pytest.mark.parametrize("years", [-1, 1])

@@ -78,7 +78,8 @@ def test_read__reports_a_cut_or_longer_file_before_any_work(db):
 @pytest.mark.slow
 def test_read__any_changed_byte_is_an_error_of_what_needs_it(db):
     rng = np.random.default_rng(5)
-    for file in _files(db):
+    root = db.root / db.record("capture", "A1").path / "zarr.json"
+    for file in [root, *_chunks(db)]:
         content = file.read_bytes()
         for at in rng.integers(len(content), size=8):
             _flip(file, at)
@@ -90,6 +91,18 @@ def test_read__any_changed_byte_is_an_error_of_what_needs_it(db):
             file.write_bytes(content)
     for values, name in zip(_read_all(db), NAMES, strict=True):
         assert np.nanmin(values) == np.nanmax(values) == 1.0, name
+
+
+def test_read__metadata_are_those_of_the_root(db):
+    """Those of single nodes are for other programs; `verify` compares them too."""
+    root = db.root / db.record("capture", "A1").path
+    copies = [p for p in _files(db) if p.name == "zarr.json" and p.parent != root]
+    assert len(copies) > 3
+    for file in copies:
+        _flip(file, file.stat().st_size // 2)
+    assert all(np.nanmin(values) == 1.0 for values in _read_all(db))
+    faults = [str(fault) for fault in db.verify()]
+    assert all(any(str(file) in fault for fault in faults) for file in copies)
 
 
 def test_read__what_does_not_need_the_damaged_chunk_is_still_read(db):
