@@ -118,7 +118,7 @@ def _spread(builder: Any, value: Any) -> Any:
 def vector_blend(
     _typing: Any, table: Any, places: Any, weights: Any, rows: Any, row: Any
 ) -> Any:
-    """rows[row] = sum over c of weights[c] table[places[c]].
+    """rows[row] = sum over c of weights[c] times the values of the table from places[c] on.
 
     Tuples of int64 and float32; arrays (., width) of float32.
     """
@@ -127,10 +127,7 @@ def vector_blend(
         source = context.make_array(signature.args[0])(context, builder, arguments[0])
         out = context.make_array(signature.args[3])(context, builder, arguments[3])
         width = cgutils.unpack_tuple(builder, source.shape, 2)[1]
-        starts = [
-            builder.mul(place, width)
-            for place in cgutils.unpack_tuple(builder, arguments[1])
-        ]
+        starts = cgutils.unpack_tuple(builder, arguments[1])
         factors = [
             _spread(builder, weight)
             for weight in cgutils.unpack_tuple(builder, arguments[2])
@@ -292,9 +289,8 @@ def plain_blend(
     for j in range(width):
         rows[row, j] = np.float32(0)
     for c in range(len(places)):
-        start = places[c] * width
         for j in range(width):
-            rows[row, j] += weights[c] * flat[start + j]
+            rows[row, j] += weights[c] * flat[places[c] + j]
 
 
 @kernel

@@ -67,7 +67,7 @@ def test_blend__is_the_weighted_sum_and_touches_one_row(calls, width):
     weights = rng.normal(size=3).astype(np.float32)
     places = np.array([6, 0, 3])
     rows = np.full((4, width), 9, np.float32)
-    calls["blend"](table, places, weights, rows, 2)
+    calls["blend"](table, places * width, weights, rows, 2)
     np.testing.assert_allclose(rows[2], weights @ table[places], atol=ROUNDING * 10)
     assert (rows[[0, 1, 3]] == 9).all()
 

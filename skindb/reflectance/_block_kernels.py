@@ -16,30 +16,25 @@ from skindb.jit import kernel
 from skindb.reflectance._lumitexel_kernels import (
     FEW,
     FITTED,
-    MIN_COSINE_SURFACE,
     OUTLIER_SPREAD,
     PAPER,
     PERCEPTUAL,
     JudgedErrors,
     Lumitexel,
     Options,
-    add_scatter,
     add_surface,
     block_memory,
     choose_kind,
     fitted_status,
     held_kinds,
     outliers,
-    polarise_rows,
     prepare,
     relative_drift,
     smallest_half_angle,
     split_diffuse,
     surface_factor,
-    turned_normals,
     weigh,
     weigh_outliers,
-    write_cosines,
     write_rows,
 )
 from skindb.reflectance._mixture_kernels import (
@@ -48,11 +43,10 @@ from skindb.reflectance._mixture_kernels import (
     coefficients,
     fit_memory,
     fit_one,
-    fit_weighted,
     predict,
     weight_covariance,
 )
-from skindb.reflectance._row_kernels import turn_rows
+from skindb.reflectance._turn_kernels import add_turned, turn_memory
 from skindb.reflectance.model import Block, JudgedFit, SurfaceFit
 from skindb.types import Matrix, Tensor32, Vector
 
@@ -169,7 +163,7 @@ def _write_covariance(
     """Covariance of the weights of surfel s by noise and by the error of R_d."""
     drift = np.empty(3)
     relative_drift(block.diffuse[s], errors.diffuse[s], drift)
-    for r in range(count):  # the errors of predictions overwrite it
+    for r in range(count):
         work.root.total[r] = b.target[0, r] + b.target[1, r] + b.target[2, r]
     weight_covariance(
         b.rows,
@@ -184,44 +178,6 @@ def _write_covariance(
         out.covariance[s],
         work,
     )
-
-
-@kernel
-def _add_turned(
-    s: int,
-    count: int,
-    block: Block,
-    tables: Tables,
-    options: Options,
-    errors: JudgedErrors,
-    out: JudgedFit,
-    b: Lumitexel,
-    work: FitMemory,
-) -> None:
-    """Add to the covariance the effect of the error of the normal of surfel s."""
-    x = out.parameters[s]
-    moved = np.empty(x.shape[0])
-    normals = np.empty((4, 3))
-    turned_normals(block.normal[s], errors.turn[s], normals)
-    for q in range(4):
-        write_cosines(normals[q], options.eta, 0.0, b)
-        split_diffuse(block.diffuse[s], count, b)
-        turn_rows(
-            tables.table,
-            normals[q],
-            b.to_light,
-            b.to_camera,
-            b.pairs,
-            count,
-            b.row_memory,
-            b.rows,
-        )
-        polarise_rows(count, b)
-        for j in range(x.shape[0]):
-            moved[j] = x[j]
-        fit_weighted(_problem(count, tables.lift, options, b), moved, work)
-        add_scatter(moved, x, out.covariance[s])
-    write_cosines(block.normal[s], options.eta, MIN_COSINE_SURFACE, b)
 
 
 @kernel
@@ -257,6 +213,7 @@ def judge_block(
     lift = tables.lift
     b = block_memory(block, table.shape[3])
     work = fit_memory(b.pairs.shape[0], table.shape[3], lift.shape[1])
+    turning = turn_memory(*errors.held.shape, table.shape[3])
     kinds = held_kinds(errors.held)
     for s in range(block.position.shape[0]):
         x = out.parameters[s]
@@ -284,12 +241,23 @@ def judge_block(
         predict(b.rows, count, x, b.surface, work.single)
         if out.counts.shape[2] > 0:
             out.outlier[s] = outliers(count, options, b, work.root, out.counts)
-        with_errors = out.covariance.shape[1] > 0
-        if with_errors:
+        if out.covariance.shape[1] > 0:
             _write_covariance(s, count, block, options, errors, out, b, work)
+            if errors.turn[s] > 0.0:
+                add_turned(
+                    block.normal[s],
+                    errors.turn[s],
+                    block.diffuse[s],
+                    table,
+                    _problem(count, lift, options, b),
+                    options.eta,
+                    x,
+                    out.covariance[s],
+                    b,
+                    work,
+                    turning,
+                )
         out.residual[s], out.residual_perceptual[s] = add_surface(count, b)
-        if with_errors and errors.turn[s] > 0.0:
-            _add_turned(s, count, block, tables, options, errors, out, b, work)
         for kind in range(1, 3):
             if kinds[kind]:
                 _write_held_error(s, kind, block, tables, errors, out, b, work)

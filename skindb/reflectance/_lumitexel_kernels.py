@@ -18,7 +18,12 @@ from skindb.jit import (
     median_of,
     unpack,
 )
-from skindb.reflectance._row_kernels import RowMemory, form_rows, row_memory
+from skindb.reflectance._row_kernels import (
+    RowMemory,
+    interpolate_rows,
+    list_rows,
+    row_memory,
+)
 from skindb.reflectance._shade_kernels import circular_reversal, transmittance
 from skindb.reflectance.model import Block, Noise
 from skindb.schema import FitStatus
@@ -157,7 +162,7 @@ def lumitexel_memory(
         np.zeros((lights, cameras), np.bool_),
         np.zeros((lights, cameras), np.bool_),
         np.empty((size, 2), np.int32),
-        row_memory(cameras),
+        row_memory(lights, cameras),
         np.zeros((size, width), np.float32),
         channels[:3],
         channels[3:6],
@@ -273,27 +278,16 @@ def surface_factor(r: int, b: Lumitexel) -> float:
 
 
 @kernel
-def polarise_rows(count: int, b: Lumitexel) -> None:
-    """Multiply rows by the factor of their samples."""
-    if b.gloss.shape[0] == 0:
-        return
-    for r in range(count):
-        factor = np.float32(surface_factor(r, b))
-        for k in range(b.rows.shape[1]):
-            b.rows[r, k] *= factor
-
-
-@kernel
 def write_cosines(n: Vector, eta: float, min_cosine: float, b: Lumitexel) -> None:
     """Write cosines and transmission factors for all directions; 0 below the limit."""
-    _transmission(n, b.to_light, eta, min_cosine, b.lit, b.enters)
-    _transmission(n, b.to_camera, eta, min_cosine, b.seen, b.leaves)
+    transmission(n, b.to_light, eta, min_cosine, b.lit, b.enters)
+    transmission(n, b.to_camera, eta, min_cosine, b.seen, b.leaves)
     for i in range(b.lit.shape[0]):
         b.enters[i] *= b.lit[i] / np.pi
 
 
 @kernel
-def _transmission(
+def transmission(
     n: Vector,
     towards: Matrix,
     eta: float,
@@ -349,15 +343,14 @@ def write_rows(n: Vector, table: Tensor32, b: Lumitexel) -> int:
     """Write the rows of the chosen samples for this normal, and the samples; returns
     their number.
     """
-    count = form_rows(
-        table, n, b.to_light, b.to_camera, b.usable, b.row_memory, b.rows, b.pairs
-    )
+    memory = b.row_memory
+    count = list_rows(n, b.to_light, b.to_camera, b.usable, b.gloss, memory, b.pairs)
+    interpolate_rows(table, n, count, memory.way, memory, b.rows)
     cameras = b.seen.shape[0]
     for r in range(count):
         at = 3 * (b.pairs[r, 0] * cameras + b.pairs[r, 1])
         for c in range(3):
             b.sample[c, r] = b.values[at + c]
-    polarise_rows(count, b)
     return int(count)
 
 

@@ -160,8 +160,6 @@ def _solve_linear(
     """Minimise the linear problem of `work.slope` and `work.aim` over x >= 0 with the
     warm start x.
     """
-    r = p.lift.shape[0]
-    right = work.right
     gram(
         p.rows,
         p.size,
@@ -171,6 +169,18 @@ def _solve_linear(
         work.reduced_right,
         work.block,
     )
+    return solve_equations(p, x, work)
+
+
+@kernel
+def solve_equations(
+    p: Problem, x: Vector, work: FitMemory
+) -> tuple[float, int, bool, float]:
+    """Solve the normal equations `work.reduced_gram` and `reduced_right` for x >= 0 with
+    the warm start x.
+    """
+    r = p.lift.shape[0]
+    right = work.right
     if r == right.shape[0]:
         # loops here and below, because copies of arrays take seconds to compile
         for i in range(r):
@@ -197,15 +207,12 @@ def _solve_linear(
 
 
 @kernel
-def fit_weighted(
-    p: Problem, x: Vector, work: FitMemory
-) -> tuple[float, int, bool, float]:
-    """Fit one surfel linearly with the warm start x.
+def weigh_rows(p: Problem, x: Vector, work: FitMemory) -> None:
+    """Write weights and right side of the linear problem of one surfel.
 
     In cube-root space, rows are weighted with the squared slopes of the cube root at M x.
     Unlike the distance in cube-root space, this fit is not biased by noise (the cube
-    root is concave). Returns the KKT residual, the iterations, whether it converged,
-    and the condition.
+    root is concave).
     """
     n = p.size
     channels = np.float32(p.target.shape[0])
@@ -222,7 +229,6 @@ def fit_weighted(
         work.slope[i] *= p.weight[i]
         work.aim[i] = work.slope[i] * total[i]
         work.slope[i] *= channels
-    return _solve_linear(p, x, work)
 
 
 @kernel
@@ -239,7 +245,8 @@ def fit_one(p: Problem, x: Vector, work: FitMemory) -> tuple[float, int, bool, f
         count = _fit_roots(p, x, work)
     else:
         x[:] = 0.0
-    kkt, last, converged, condition = fit_weighted(p, x, work)
+    weigh_rows(p, x, work)
+    kkt, last, converged, condition = _solve_linear(p, x, work)
     return kkt, count + last, converged, condition
 
 

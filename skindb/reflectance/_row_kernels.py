@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from skindb.jit import LANES, blend, fast_kernel, inline_fast_kernel, kernel
+from skindb.jit import blend, fast_kernel, inline_fast_kernel, kernel
 from skindb.types import (
     BoolCube,
     BoolMatrix,
@@ -62,8 +62,8 @@ ZERO, ONE, MIN_SQUARE, HALF_PI, PI = (
     np.float32(c) for c in (0.0, 1.0, 1e-30, math.pi / 2, math.pi)
 )
 NONE, STEP, TWO = (np.int32(c) for c in (0, 1, 2))
-X, Y, Z, ACROSS_X, ACROSS_Y, ACROSS_Z, COSINE = range(7)  # rows of `RowMemory.faces`
-THETA_H, THETA_D, PHI_D = range(3)  # rows of `RowMemory.place`
+THETA_H, THETA_D, PHI_D = range(3)
+CHUNK = 64  # rows whose cells are found together
 ROOT_HALF = np.float32(math.sqrt(0.5))
 SMALLEST_SINE = np.float32(1e-6)
 
@@ -170,7 +170,7 @@ def _interpolate(
 
 
 @inline_fast_kernel
-def _arctangent_single(y: Real, x: Real) -> Real:
+def arctangent(y: Real, x: Real) -> Real:
     """atan2 for x, y >= 0 in single precision."""
     large = max(max(x, y), MIN_SQUARE)
     t = min(x, y) / large
@@ -181,334 +181,242 @@ def _arctangent_single(y: Real, x: Real) -> Real:
     return HALF_PI - t * total if y > x else t * total
 
 
-@kernel
-def _face_cameras(
-    n: Vector, to_camera: Matrix, faces: Matrix32, cameras: IntVector32
-) -> int:
-    """Write the input of `_cells`, faces (7, padded), and the indices of cameras above
-    the horizon; returns the number.
-
-    The last camera is repeated to complete the last vector.
-    """
-    count = 0
-    for o in range(to_camera.shape[0]):
-        x = to_camera[o, 0]
-        y = to_camera[o, 1]
-        z = to_camera[o, 2]
-        cosine = n[0] * x + n[1] * y + n[2] * z
-        if cosine > 0.0 and cosine < 2.0:  # false for NaN and inf
-            faces[X, count], faces[Y, count], faces[Z, count] = x, y, z
-            faces[ACROSS_X, count] = n[1] * z - n[2] * y
-            faces[ACROSS_Y, count] = n[2] * x - n[0] * z
-            faces[ACROSS_Z, count] = n[0] * y - n[1] * x
-            faces[COSINE, count] = cosine
-            cameras[count] = o
-            count += 1
-    for q in range(count, faces.shape[1]):
-        for k in range(faces.shape[0]):
-            faces[k, q] = faces[k, count - 1]
-    return count
-
-
-@inline_fast_kernel
-def _cells_per_angle(table: Tensor32) -> SingleTriple:
-    """Number of cells per unit of sqrt(theta_h), theta_d and phi_d."""
-    nh, nd, n_phi, _ = table.shape
-    return (
-        np.float32(math.sqrt(2.0 / math.pi) * (nh - 1)),
-        np.float32(2.0 / math.pi * (nd - 1)),
-        np.float32(n_phi / math.pi),
-    )
-
-
-@inline_fast_kernel
-def _nodes(table: Tensor32) -> tuple[np.int32, np.int32, np.int32]:
-    nh, nd, n_phi, _ = table.shape
-    return np.int32(nh), np.int32(nd), np.int32(n_phi)
-
-
-@inline_fast_kernel
-def _cross(n: Vector, x: float, y: float, z: float) -> SingleTriple:
-    """N x (x, y, z)."""
-    return (
-        np.float32(n[1] * z - n[2] * y),
-        np.float32(n[2] * x - n[0] * z),
-        np.float32(n[0] * y - n[1] * x),
-    )
-
-
-@inline_fast_kernel
-def _cells(
-    wi: SingleTriple,
-    across: SingleTriple,
-    cosine: np.float32,
-    faces: Matrix32,
-    count: int,
-    size: SingleTriple,
-    place: Matrix32,
-) -> None:
-    """Coordinates in the table [cells], `place` (3, count), of one light with `count`
-    cameras; `across` is n x wi.
-
-    With h = wi + wo unnormalised: tan(theta_h) = |n x h| / n h, tan^2(theta_d) = (1 -
-    wi wo) / (1 + wi wo), and phi_d is the angle between n (wo x wi) / |h| and (cos_o -
-    cos_i) / 2. Single precision has an error of 0.02 cells. `size` is the number of
-    cells per unit of sqrt(theta_h), theta_d and phi_d.
-    """
-    for q in range(count):
-        x = faces[X, q]
-        y = faces[Y, q]
-        z = faces[Z, q]
-        bx = faces[ACROSS_X, q] + across[0]
-        by = faces[ACROSS_Y, q] + across[1]
-        bz = faces[ACROSS_Z, q] + across[2]
-        both = wi[0] * x + wi[1] * y + wi[2] * z
-        near = math.sqrt(max(ONE + both, MIN_SQUARE))
-        far = math.sqrt(max(ONE - both, ZERO))
-        sin_h = math.sqrt(bx * bx + by * by + bz * bz)
-        theta_h = _arctangent_single(sin_h, cosine + faces[COSINE, q])
-        theta_d = _arctangent_single(far, near)
-        side = (
-            wi[0] * faces[ACROSS_X, q]
-            + wi[1] * faces[ACROSS_Y, q]
-            + wi[2] * faces[ACROSS_Z, q]
-        ) / near
-        along = (faces[COSINE, q] - cosine) * ROOT_HALF
-        # phi_d has period pi, so phi_d < 0 is the pair with both signs reversed
-        along = along if side >= ZERO else -along
-        phi = _arctangent_single(abs(side), abs(along))
-        phi = PI - phi if along < ZERO else phi
-        place[THETA_H, q] = math.sqrt(theta_h) * size[0]
-        place[THETA_D, q] = theta_d * size[1]
-        place[PHI_D, q] = phi * size[2] if sin_h > SMALLEST_SINE else ZERO
-
-
-@inline_fast_kernel
-def _row(
-    flat: Matrix32,
-    shape: tuple[np.int32, np.int32, np.int32],
-    place: Matrix32,
-    q: int,
-    cosine: np.float32,
-    rows: Matrix32,
-    row: int,
-) -> None:
-    """One row: cosine times the trilinear sum of the eight corners of the cell around
-    place[:, q].
-    """
-    x = place[THETA_H, q]
-    y = place[THETA_D, q]
-    z = place[PHI_D, q]
-    i = min(np.int32(x), shape[0] - TWO)
-    j = min(np.int32(y), shape[1] - TWO)
-    k = np.int32(z)
-    fx = x - np.float32(i)
-    fy = y - np.float32(j)
-    fz = z - np.float32(k)
-    corner = np.int64((i * shape[1] + j) * shape[2])
-    a = corner + (k if k < shape[2] else NONE)
-    b = corner + (k + STEP if k + STEP < shape[2] else NONE)
-    # to the next theta_d, theta_h
-    along = np.int64(shape[2])
-    across = np.int64(shape[1] * shape[2])
-    gx = (ONE - fx) * cosine
-    fx = fx * cosine
-    gy = ONE - fy
-    gz = ONE - fz
-    low = gx * gy
-    high = gx * fy
-    low_far = fx * gy
-    high_far = fx * fy
-    blend(
-        flat,
-        (
-            a,
-            b,
-            a + along,
-            b + along,
-            a + across,
-            b + across,
-            a + across + along,
-            b + across + along,
-        ),
-        (
-            low * gz,
-            low * fz,
-            high * gz,
-            high * fz,
-            low_far * gz,
-            low_far * fz,
-            high_far * gz,
-            high_far * fz,
-        ),
-        rows,
-        row,
-    )
-
-
 class RowMemory(NamedTuple):
-    """Memory for `form_rows` and `turn_rows`, one per thread; arrays over cameras are
-    padded to multiples of LANES.
+    """Memory for the rows of one surfel; each thread needs its own.
+
+    `way` holds CHUNK rows in each of its own, and `share` and `corner` have one dimension:
+    for constant distances LLVM needs no tests whether addresses overlap.
     """
 
-    # (7, cameras) direction X, Y, Z, normal x direction ACROSS_X, ACROSS_Y, ACROSS_Z,
-    # and COSINE
-    faces: Matrix32
-    place: Matrix32  # (3, cameras) coordinates THETA_H, THETA_D, PHI_D in the table [cells]
+    camera: Matrix32  # (cameras, 3) directions
     above: IntVector32  # (cameras,) indices of cameras above the horizon
     # (cameras + 1,) indices into `above` of cameras with a usable sample of a light
     chosen: IntVector32
+    # (chunks, 7 CHUNK) directions to light and camera, and a factor, of every row
+    way: Matrix32
+    share: Vector32  # (8 CHUNK,) weights of the corners of the cells of some rows
+    corner: IntVector32  # (2 CHUNK,) addresses in the table of their first two corners
 
 
 @kernel
-def row_memory(cameras: int) -> RowMemory:
-    """Memory for up to `cameras` cameras."""
-    padded = (cameras + LANES - 1) // LANES * LANES
-    # one block, for which LLVM checks fewer addresses for aliasing
-    single = np.empty((10, padded), np.float32)
+def row_memory(lights: int, cameras: int) -> RowMemory:
+    """Memory for a sample of every light and camera."""
     return RowMemory(
-        single[:7],
-        single[7:],
-        np.empty(padded, np.int32),
-        np.empty(padded + 1, np.int32),
+        np.empty((cameras, 3), np.float32),
+        np.empty(cameras, np.int32),
+        np.empty(cameras + 1, np.int32),
+        ways(lights * cameras),
+        np.empty(8 * CHUNK, np.float32),
+        np.empty(2 * CHUNK, np.int32),
     )
 
 
+@kernel
+def ways(rows: int) -> Matrix32:
+    """`RowMemory.way` for a number of rows."""
+    return np.zeros(((rows + CHUNK - 1) // CHUNK, 7 * CHUNK), np.float32)
+
+
 @fast_kernel
-def form_rows(
+def _write_cells(
+    n: SingleTriple,
+    way: Vector32,
+    count: int,
+    shape: tuple[int, ...],
+    share: Vector32,
+    corner: IntVector32,
+) -> None:
+    """Write addresses and weights, cosine to the light included, of the corners of the
+    cells of up to CHUNK rows in a table of `shape`; 0 below the horizon.
+
+    With h = wi + wo unnormalised: tan(theta_h) = |n x h| / n h, tan^2(theta_d) = (1 -
+    wi wo) / (1 + wi wo), and phi_d is the angle between n (wo x wi) / |h| and (cos_o -
+    cos_i) / 2. Single precision has an error of 0.02 cells.
+    """
+    nd = np.int32(shape[1])
+    last_h = np.int32(shape[0] - 2)
+    last_d = np.int32(shape[1] - 2)
+    n_phi = np.int32(shape[2])
+    width = np.int32(shape[3])  # a table has fewer than 2^31 values
+    # cells per unit of sqrt(theta_h), theta_d and phi_d
+    per_h = np.float32(math.sqrt(2.0 / math.pi) * (shape[0] - 1))
+    per_d = np.float32(2.0 / math.pi * (shape[1] - 1))
+    per_phi = np.float32(shape[2] / math.pi)
+    for q in range(count):
+        ix = way[q]
+        iy = way[CHUNK + q]
+        iz = way[2 * CHUNK + q]
+        ox = way[3 * CHUNK + q]
+        oy = way[4 * CHUNK + q]
+        oz = way[5 * CHUNK + q]
+        hx = ix + ox
+        hy = iy + oy
+        hz = iz + oz
+        bx = n[1] * hz - n[2] * hy
+        by = n[2] * hx - n[0] * hz
+        bz = n[0] * hy - n[1] * hx
+        sin_h = math.sqrt(bx * bx + by * by + bz * bz)
+        lit = n[0] * ix + n[1] * iy + n[2] * iz
+        seen = n[0] * ox + n[1] * oy + n[2] * oz
+        theta_h = arctangent(sin_h, max(lit + seen, ZERO))
+        both = ix * ox + iy * oy + iz * oz
+        near = math.sqrt(max(ONE + both, MIN_SQUARE))
+        far = math.sqrt(max(ONE - both, ZERO))
+        theta_d = arctangent(far, near)
+        side = (
+            n[0] * (oy * iz - oz * iy)
+            + n[1] * (oz * ix - ox * iz)
+            + n[2] * (ox * iy - oy * ix)
+        ) / near
+        along = (seen - lit) * ROOT_HALF
+        # phi_d has period pi, so phi_d < 0 is the pair with both signs reversed
+        along = along if side >= ZERO else -along
+        phi = arctangent(abs(side), abs(along))
+        phi = PI - phi if along < ZERO else phi
+        x = math.sqrt(theta_h) * per_h
+        y = theta_d * per_d
+        z = phi * per_phi if sin_h > SMALLEST_SINE else ZERO
+        i = np.int32(min(np.int32(x), last_h))
+        j = np.int32(min(np.int32(y), last_d))
+        k = np.int32(z)
+        fx = x - np.float32(i)
+        fy = y - np.float32(j)
+        fz = z - np.float32(k)
+        # Numba adds and multiplies in 64 bits, which are slow in vector registers
+        first = np.int32(np.int32(np.int32(i * nd) + j) * n_phi)
+        after = np.int32(k + STEP)
+        k = k if k < n_phi else NONE
+        after = after if after < n_phi else NONE
+        corner[q] = np.int32(np.int32(first + k) * width)
+        corner[CHUNK + q] = np.int32(np.int32(first + after) * width)
+        cosine = lit * way[6 * CHUNK + q] if min(lit, seen) > ZERO else ZERO
+        gx = (ONE - fx) * cosine
+        fx = fx * cosine
+        gy = ONE - fy
+        gz = ONE - fz
+        share[q] = gx * gy * gz
+        share[CHUNK + q] = gx * gy * fz
+        share[2 * CHUNK + q] = gx * fy * gz
+        share[3 * CHUNK + q] = gx * fy * fz
+        share[4 * CHUNK + q] = fx * gy * gz
+        share[5 * CHUNK + q] = fx * gy * fz
+        share[6 * CHUNK + q] = fx * fy * gz
+        share[7 * CHUNK + q] = fx * fy * fz
+
+
+@fast_kernel
+def interpolate_rows(
     table: Tensor32,
+    n: Vector,
+    count: int,
+    way: Matrix32,
+    memory: RowMemory,
+    rows: Matrix32,
+) -> None:
+    """Write the rows of the directions in `way`: cosine to the light times the trilinear
+    sum of the eight corners of the cell; zeros below the horizon.
+
+    The cells of some rows are found in vector registers, then they are read. Neighbouring
+    surfels use the same cells, so surfels in spatial order keep this part of the table in
+    the cache. The width of `table` and `rows` must be a multiple of LANES.
+    """
+    flat = table.reshape(-1, table.shape[3])
+    share = memory.share
+    corner = memory.corner
+    # to the next theta_d, theta_h
+    along = np.int64(table.shape[2] * table.shape[3])
+    across = table.shape[1] * along
+    normal = (np.float32(n[0]), np.float32(n[1]), np.float32(n[2]))
+    for begin in range(0, count, CHUNK):
+        size = min(count - begin, CHUNK)
+        _write_cells(normal, way[begin // CHUNK], size, table.shape, share, corner)
+        for q in range(size):
+            a = np.int64(corner[q])
+            b = np.int64(corner[CHUNK + q])
+            blend(
+                flat,
+                (
+                    a,
+                    b,
+                    a + along,
+                    b + along,
+                    a + across,
+                    b + across,
+                    a + across + along,
+                    b + across + along,
+                ),
+                (
+                    share[q],
+                    share[CHUNK + q],
+                    share[2 * CHUNK + q],
+                    share[3 * CHUNK + q],
+                    share[4 * CHUNK + q],
+                    share[5 * CHUNK + q],
+                    share[6 * CHUNK + q],
+                    share[7 * CHUNK + q],
+                ),
+                rows,
+                begin + q,
+            )
+
+
+@fast_kernel
+def list_rows(
     n: Vector,
     to_light: Matrix,
     to_camera: Matrix,
     usable: BoolMatrix,
+    gloss: Matrix32,
     memory: RowMemory,
-    rows: Matrix32,
     index: IntMatrix32,
 ) -> int:
-    """Write the rows of one surfel, by light and then by camera; returns their number.
-
-    For each light, the coordinates of all cameras are computed in vector registers,
-    then the rows are interpolated. Neighbouring surfels use the same cells, so surfels
-    in spatial order keep this part of the table in the cache. The width of `table` and
-    `rows` must be a multiple of LANES.
+    """Write light and camera, directions, and the factor `gloss` (lights, cameras), 1 for
+    (0, cameras), of the rows of one surfel, by light and then by camera; returns their
+    number.
     """
-    faces = memory.faces
-    place = memory.place
     cameras = memory.above
     chosen = memory.chosen
-    seen = _face_cameras(n, to_camera, faces, cameras)
-    if seen == 0:
-        return 0
-    size = _cells_per_angle(table)
-    shape = _nodes(table)
-    flat = table.reshape(-1, table.shape[3])
-    padded = (seen + LANES - 1) // LANES * LANES
+    camera = memory.camera
+    polarised = gloss.shape[0] > 0
+    above = 0
+    for o in range(to_camera.shape[0]):
+        if _is_above(n, to_camera[o]):
+            cameras[above] = o
+            above += 1
+        for k in range(3):
+            memory.camera[o, k] = to_camera[o, k]
     count = 0
     for i in range(to_light.shape[0]):
-        x = to_light[i, 0]
-        y = to_light[i, 1]
-        z = to_light[i, 2]
-        cosine = n[0] * x + n[1] * y + n[2] * z
-        if not (cosine > 0.0 and cosine < 2.0):  # also NaN and inf
+        if not _is_above(n, to_light[i]):
             continue
-        wi = (np.float32(x), np.float32(y), np.float32(z))
-        across = _cross(n, x, y, z)
-        _cells(wi, across, np.float32(cosine), faces, padded, size, place)
         used = np.int64(0)
-        for q in range(seen):  # without branches, as usable samples are unpredictable
-            chosen[used] = q
+        for q in range(above):  # without branches, as usable samples are unpredictable
+            chosen[used] = cameras[q]
             used += np.int64(usable[i, cameras[q]])
+        x = np.float32(to_light[i, 0])
+        y = np.float32(to_light[i, 1])
+        z = np.float32(to_light[i, 2])
         for c in range(used):
-            q = chosen[c]
-            index[count, 0], index[count, 1] = i, cameras[q]
-            _row(flat, shape, place, q, np.float32(cosine), rows, count)
+            o = chosen[c]
+            way = memory.way[count // CHUNK]
+            q = count % CHUNK
+            way[q] = x
+            way[CHUNK + q] = y
+            way[2 * CHUNK + q] = z
+            way[3 * CHUNK + q] = camera[o, 0]
+            way[4 * CHUNK + q] = camera[o, 1]
+            way[5 * CHUNK + q] = camera[o, 2]
+            way[6 * CHUNK + q] = gloss[i, o] if polarised else ONE
+            index[count, 0], index[count, 1] = i, o
             count += 1
     return count
 
 
-@fast_kernel
-def turn_rows(
-    table: Tensor32,
-    n: Vector,
-    to_light: Matrix,
-    to_camera: Matrix,
-    index: IntMatrix32,
-    count: int,
-    memory: RowMemory,
-    rows: Matrix32,
-) -> None:
-    """Rows of the samples `index` (count, 2) as from `form_rows`, with another normal.
-
-    Samples below the horizon of this normal have rows of zeros.
-    """
-    faces = memory.faces
-    place = memory.place
-    size = _cells_per_angle(table)
-    shape = _nodes(table)
-    flat = table.reshape(-1, table.shape[3])
-    begin = 0
-    while begin < count:
-        i = index[begin, 0]
-        end = begin
-        while end < count and index[end, 0] == i:
-            end += 1
-        x = to_light[i, 0]
-        y = to_light[i, 1]
-        z = to_light[i, 2]
-        cosine = max(n[0] * x + n[1] * y + n[2] * z, 0.0)
-        _face_samples(n, to_camera, index, begin, end, faces)
-        across = _cross(n, x, y, z)
-        padded = (end - begin + LANES - 1) // LANES * LANES
-        _cells(
-            (np.float32(x), np.float32(y), np.float32(z)),
-            across,
-            np.float32(cosine),
-            faces,
-            padded,
-            size,
-            place,
-        )
-        for r in range(begin, end):
-            above = faces[COSINE, r - begin] > ZERO
-            _row(
-                flat,
-                shape,
-                place,
-                r - begin,
-                np.float32(cosine) if above else ZERO,
-                rows,
-                r,
-            )
-        begin = end
-
-
 @kernel
-def _face_samples(
-    n: Vector,
-    to_camera: Matrix,
-    index: IntMatrix32,
-    begin: int,
-    end: int,
-    faces: Matrix32,
-) -> None:
-    """Write the input of `_cells` for the cameras of samples begin to end; the cosine
-    is 0 below the horizon.
-    """
-    for q in range(end - begin):
-        o = index[begin + q, 1]
-        x = to_camera[o, 0]
-        y = to_camera[o, 1]
-        z = to_camera[o, 2]
-        faces[X, q], faces[Y, q], faces[Z, q] = x, y, z
-        faces[ACROSS_X, q] = n[1] * z - n[2] * y
-        faces[ACROSS_Y, q] = n[2] * x - n[0] * z
-        faces[ACROSS_Z, q] = n[0] * y - n[1] * x
-        faces[COSINE, q] = max(n[0] * x + n[1] * y + n[2] * z, 0.0)
-    for q in range(
-        end - begin, min((end - begin + LANES - 1) // LANES * LANES, faces.shape[1])
-    ):
-        for k in range(faces.shape[0]):
-            faces[k, q] = faces[k, end - begin - 1]
+def _is_above(n: Vector, towards: Vector) -> bool:
+    """Whether a direction is above the horizon; false for NaN and inf."""
+    cosine = n[0] * towards[0] + n[1] * towards[1] + n[2] * towards[2]
+    return bool(cosine > 0.0 and cosine < 2.0)
 
 
 @kernel
@@ -523,20 +431,20 @@ def fill_rows(
     index: IntMatrix32,
 ) -> None:
     """Write the rows of every surfel, starting at its offset."""
-    memory = row_memory(to_camera.shape[1])
+    memory = row_memory(to_light.shape[1], to_camera.shape[1])
+    gloss = np.empty((0, to_camera.shape[1]), np.float32)
     for s in range(normal.shape[0]):
         lo = offsets[s]
-        hi = offsets[s + 1]
-        form_rows(
-            table,
+        count = list_rows(
             normal[s],
             to_light[s],
             to_camera[s],
             usable[s],
+            gloss,
             memory,
-            rows[lo:hi],
-            index[lo:hi],
+            index[lo : offsets[s + 1]],
         )
+        interpolate_rows(table, normal[s], count, memory.way, memory, rows[lo:])
 
 
 @fast_kernel

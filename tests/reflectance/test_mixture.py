@@ -432,33 +432,27 @@ def test_to_roots__every_magnitude():
     np.testing.assert_allclose(q, np.cbrt(y**2 + floor**2) ** -1, rtol=1e-6)
 
 
-def test_turn_rows__are_the_rows_of_the_other_normal():
+def test_interpolate_rows__of_another_normal_and_a_factor():
     n, light, camera, usable = _scene()
     turned = _unit(n + 0.3 * np.random.default_rng(5).normal(size=n.shape))
     table = np.random.default_rng(8).uniform(0.1, 1, (30, 20, 9, 8)).astype(np.float32)
-    memory = _row_kernels.row_memory(5)
+    gloss = np.random.default_rng(9).uniform(0.1, 1, (9, 5)).astype(np.float32)
+    memory = _row_kernels.row_memory(9, 5)
     below = 0
     for s in range(len(n)):
         rows = np.empty((45, 8), np.float32)
         index = np.empty((45, 2), np.int32)
-        count = _row_kernels.form_rows(
-            table, n[s], light[s], camera[s], usable[s], memory, rows, index
+        count = _row_kernels.list_rows(
+            n[s], light[s], camera[s], usable[s], gloss, memory, index
         )
-        _row_kernels.turn_rows(
-            table, turned[s], light[s], camera[s], index, count, memory, rows
-        )
+        _row_kernels.interpolate_rows(table, turned[s], count, memory.way, memory, rows)
         wi = light[s, index[:count, 0]]
         wo = camera[s, index[:count, 1]]
         up = (wi @ turned[s] > 0) & (wo @ turned[s] > 0)
-        want = (
-            lookup(
-                table, *half_difference(wi, wo, np.broadcast_to(turned[s], wi.shape))
-            )
-            * (wi @ turned[s])[:, None]
-        )
-        np.testing.assert_allclose(
-            rows[:count], np.where(up[:, None], want, 0), rtol=SINGLE_ROWS
-        )
+        angles = half_difference(wi, wo, np.broadcast_to(turned[s], wi.shape))
+        factor = (wi @ turned[s]) * gloss[*index[:count].T]
+        want = np.where(up[:, None], lookup(table, *angles) * factor[:, None], 0)
+        np.testing.assert_allclose(rows[:count], want, rtol=SINGLE_ROWS)
         below += int((~up).sum())
     assert below > 10
 
