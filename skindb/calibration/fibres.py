@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from scipy import ndimage, optimize
 
-from skindb.calibration.frame_checks import disagreement
+from skindb.calibration.frame_checks import compared_exposures, disagreement
 from skindb.calibration.radiance import Image, merge_exposures
 from skindb.calibration.setup import MIN_FLAT_FRAMES, of_devices
 from skindb.errors import Fault, InputError, attempt, require
@@ -52,9 +52,8 @@ def placement_signal(
         attempt(faults, partial(read_strip, exposure))
     if faults:
         raise InputError(dict.fromkeys(faults))
-    fault = disagreement(
-        f"{probe.file}[exposures]", probe.exposures, strips, probe.sensor
-    )
+    exposures = compared_exposures(probe.exposures, strips, probe.sensor)
+    fault = disagreement(f"{probe.file}[exposures]", exposures, probe.sensor)
     if fault is not None:
         finding = f"{place_text(site, placement)}: bracket {fault.found}"
         raise InputError(replace(fault, found=finding))

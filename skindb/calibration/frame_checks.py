@@ -8,6 +8,7 @@ from concurrent.futures import Executor
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -100,16 +101,16 @@ def view_faults(
     if sensor.kind.bits == 0:
         fault = _linear_fault(place, frames[0])
     else:
-        names = [*dome.exposures]
+        seconds = dict(zip(dome.exposures, merger.seconds, strict=True))
         thinned = [_thinned(frame) for frame in frames]
         dark = None if merger.dark is None else [_thinned(x) for x in merger.dark]
-        fault = _saturated_fault(place, thinned, sensor) or _below_fault(
-            place, names, thinned, dark, sensor
+        exposures = compared_exposures(seconds, thinned, sensor, dark=dark)
+        fault = _saturated_fault(place, exposures, sensor) or _below_fault(
+            place, exposures, sensor, dark=dark is not None
         )
         if fault is None:
             view += "exposure "
-            seconds = dict(zip(names, merger.seconds, strict=True))
-            fault = disagreement(place, seconds, thinned, sensor, dark=dark)
+            fault = disagreement(place, exposures, sensor)
     return [] if fault is None else [replace(fault, found=view + fault.found)]
 
 
@@ -134,51 +135,63 @@ def checked_view(
     return frames
 
 
-def disagreement(
-    place: str,
+class ComparedExposure(NamedTuple):
+    """One exposure of a view, or some of its pixels."""
+
+    name: str
+    seconds: float
+    frame: Frame
+    signal: Float32  # relative exposure
+    slope: Float32  # its change per value of the file
+
+
+def compared_exposures(
     seconds: Mapping[str, float],
     frames: Sequence[Frame],
     sensor: SensorRecord,
     *,
     dark: Sequence[Frame] | None = None,
+) -> list[ComparedExposure]:
+    """The exposures of a view; `frames`, and dark ones, are in the order of `seconds`."""
+    darks: Sequence[Frame | None] = dark or [None] * len(frames)
+    return [
+        ComparedExposure(
+            name, seconds[name], frame, *relative_exposure(frame, black, sensor)
+        )
+        for name, frame, black in zip(seconds, frames, darks, strict=True)
+    ]
+
+
+def disagreement(
+    place: str, exposures: Sequence[ComparedExposure], sensor: SensorRecord
 ) -> Fault | None:
-    """Fault of two neighbouring exposures with different radiance; `frames` are in the
-    order of `seconds`.
-    """
+    """Fault of two neighbouring exposures of a view with different radiance."""
     rule = (
         "exposures of one view must have the same radiance: check seconds, "
         "black_level and response"
     )
     cure = "assign the correct seconds and frames to each exposure"
-    exposures = [
-        (
-            seconds[name],
-            name,
-            relative_exposure(frame, None if dark is None else dark[i], sensor)[0],
-            frame,
-        )
-        for i, (name, frame) in enumerate(zip(seconds, frames, strict=True))
-    ]
-    exposures.sort(key=lambda exposure: exposure[0])
-    for (a, short, low, dim), (b, long, high, bright) in pairwise(exposures):
-        ratio, apart = _radiance_ratio(sensor, (dim, low, a), (bright, high, b))
+    ordered = sorted(exposures, key=lambda exposure: exposure.seconds)
+    for short, long in pairwise(ordered):
+        ratio, apart = _radiance_ratio(sensor, short, long)
         similar = 1 / MAX_RADIANCE_RATIO < ratio < MAX_RADIANCE_RATIO
         if np.isnan(ratio) or (similar and apart <= MAX_APART_FRACTION):
             continue
-        finding = f"{short} ({a:.3g} s) has {ratio:.3g} times the radiance of {long} ({b:.3g} s)"
+        finding = (
+            f"{short.name} ({short.seconds:.3g} s) has {ratio:.3g} times the radiance "
+            f"of {long.name} ({long.seconds:.3g} s)"
+        )
         if similar:
             finding = (
-                f"{short} and {long} differ in {apart:.0%} of the values that both must "
-                "contain"
+                f"{short.name} and {long.name} differ in {apart:.0%} of the values that "
+                "both must contain"
             )
         return Fault(place, rule, finding, cure)
     return None
 
 
 def _radiance_ratio(
-    sensor: SensorRecord,
-    short: tuple[Frame, Float32, float],
-    long: tuple[Frame, Float32, float],
+    sensor: SensorRecord, short: ComparedExposure, long: ComparedExposure
 ) -> tuple[float, float]:
     """Median ratio of the radiance of a short exposure to that of a long one, and the
     fraction of values that differ.
@@ -186,19 +199,23 @@ def _radiance_ratio(
     Compared are values that, according to one of them, both must record well, so that a
     black or white frame also contradicts the other one. NaN for too few values.
     """
-    (dim, low, a), (bright, high, b) = short, long
+    low = short.signal
+    high = long.signal
+    times = long.seconds / short.seconds
     # for a linear response
     slope = np.asarray([1 / (sensor.white - sensor.black)], np.float32)
     read = float(read_sigma(slope, sensor)[0])
     minimum = max(MIN_SIGNAL, MIN_SIGNAL_DEVIATIONS * read)
     # the short one is noisier: near the limit it would select pixels that noise has raised
-    by_short = (dim < sensor.white) & (low > 2 * minimum) & (low * (b / a) < MAX_SIGNAL)
-    by_long = (bright < sensor.white) & (high < MAX_SIGNAL) & (high * (a / b) > minimum)
-    good = by_short | by_long
+    by_short = (low > 2 * minimum) & (low * times < MAX_SIGNAL)
+    by_long = (high < MAX_SIGNAL) & (high / times > minimum)
+    good = (by_short & (short.frame < sensor.white)) | (
+        by_long & (long.frame < sensor.white)
+    )
     if good.sum() < MIN_RATIO_VALUES:
         return float("nan"), float("nan")
     by_short_values = np.maximum(low[good], 0)
-    by_long_values = np.maximum(high[good] * np.float32(a / b), 0)
+    by_long_values = np.maximum(high[good] / np.float32(times), 0)
     larger = np.maximum(by_short_values, by_long_values)
     noise = MAX_BELOW_DEVIATIONS * np.sqrt(read**2 + larger / sensor.full_electrons)
     limit = (MAX_RADIANCE_RATIO - 1) * larger + (noise + MIN_SIGNAL)
@@ -208,10 +225,10 @@ def _radiance_ratio(
 
 
 def _saturated_fault(
-    place: str, frames: Sequence[Frame], sensor: SensorRecord
+    place: str, exposures: Sequence[ComparedExposure], sensor: SensorRecord
 ) -> Fault | None:
     """Fault of a picture that is at the white level everywhere, in every exposure."""
-    if all((frame >= sensor.white).all() for frame in frames):
+    if all(exposure.frame.min() >= sensor.white for exposure in exposures):
         return Fault(
             place,
             "a photograph must not be saturated everywhere",
@@ -223,31 +240,29 @@ def _saturated_fault(
 
 def _below_fault(
     place: str,
-    names: Sequence[str],
-    frames: Sequence[Frame],
-    dark: Sequence[Frame] | None,
+    exposures: Sequence[ComparedExposure],
     sensor: SensorRecord,
+    *,
+    dark: bool,
 ) -> Fault | None:
     """Fault of a picture that is darker than black: the black level or the dark frames
     are too high.
     """
-    for i, frame in enumerate(frames):
-        signal, slope = relative_exposure(
-            frame, None if dark is None else dark[i], sensor
-        )
-        limit = -MAX_BELOW - MAX_BELOW_DEVIATIONS * read_sigma(slope, sensor)
-        below = float((signal < limit).mean())
+    for exposure in exposures:
+        sigma = read_sigma(exposure.slope, sensor)
+        limit = -MAX_BELOW - MAX_BELOW_DEVIATIONS * sigma
+        below = float((exposure.signal < limit).mean())
         if below > MAX_BELOW_FRACTION:
             reference = "black_level"
             cure = "correct black_level"
-            if dark is not None:
+            if dark:
                 reference = "the dark frame"
                 cure = "take the dark frames again, with the exposures of the face"
             rule = (
                 f"at most {MAX_BELOW_FRACTION:.0%} of a frame may be darker than "
                 f"{reference}, beyond noise"
             )
-            return Fault(place, rule, f"{below:.0%} of exposure {names[i]}", cure)
+            return Fault(place, rule, f"{below:.0%} of exposure {exposure.name}", cure)
     return None
 
 
@@ -432,7 +447,7 @@ def _dark_offsets(
 def _thinned(frame: Frame) -> Frame:
     """At most `MAX_COMPARED_PIXELS` pixels of a frame, evenly spread."""
     step = int(np.ceil(np.sqrt(frame.shape[0] * frame.shape[1] / MAX_COMPARED_PIXELS)))
-    return frame[::step, ::step]
+    return np.ascontiguousarray(frame[::step, ::step])
 
 
 class SensorPatterns:

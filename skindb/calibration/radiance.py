@@ -300,14 +300,16 @@ def _only(frames: Sequence[Frame]) -> Frame:
 def relative_exposure(
     frame: Frame, dark: Frame | np.float32 | None, sensor: SensorRecord
 ) -> tuple[Image, Image]:
-    """Relative exposure (1 at the white level) and its slope per value of the file."""
+    """Relative exposure (1 at the white level) and its slope per value of the file; one
+    slope for a linear response.
+    """
     span = np.float32(sensor.white - sensor.black)
     black = np.float32(sensor.black)
     level = frame.astype(np.float32) - (
         black if dark is None else dark.astype(np.float32)
     )
     if sensor.response is None:
-        return level / span, np.broadcast_to(1 / span, frame.shape)
+        return level / span, np.full((1,) * frame.ndim, 1 / span)
     values = sensor.response[:, 0]
     value = level + black
     signal = np.empty(frame.shape, np.float32)

@@ -402,26 +402,30 @@ def _in_picture(surfels: SurfelSet, camera: CameraRecord) -> tuple[Float64, Mask
 
 
 def depth_map(
-    camera: CameraRecord, scene: RayScene
+    camera: CameraRecord, scene: RayScene, near: Float64
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Distance (h, w) mm of the surface along the rays (h, w, 3) through the pixel
-    centres; infinity outside it.
+    """Distance (h, w) mm of the surface along the rays (h, w, 3) through the centres of
+    the pixels within EDGE_PX of positions (n, 2); infinity outside the surface.
     """
     rays = np.empty((camera.height, camera.width, 3), np.float32)
-    distance = np.empty((camera.height, camera.width), np.float32)
+    distance = np.full((camera.height, camera.width), np.inf, np.float32)
+    reach = EDGE_PX + 1  # of a pixel's corner
     centre = camera.centre
-    column = np.arange(camera.width) + 0.5
     # in strips, whose arrays stay in the cache: allocating large arrays takes longer
     # than filling them
     for top in range(0, camera.height, STRIP_ROWS):
-        strip = slice(top, min(top + STRIP_ROWS, camera.height))
-        pixels = np.stack(
-            np.meshgrid(column, np.arange(camera.height)[strip] + 0.5), axis=-1
-        )
-        rays[strip] = camera.rays(pixels)
-        distance[strip] = scene.distances(centre, rays[strip].reshape(-1, 3)).reshape(
-            distance[strip].shape
-        )
+        bottom = min(top + STRIP_ROWS, camera.height)
+        row = near[:, 1]
+        column = near[(row > top - reach) & (row < bottom + reach), 0]
+        if not len(column):
+            continue
+        left = max(int(column.min() - reach), 0)
+        right = min(int(column.max() + reach) + 1, camera.width)
+        pixels = np.mgrid[left:right, top:bottom].T + 0.5
+        part = np.s_[top:bottom, left:right]
+        rays[part] = camera.rays(pixels)
+        way = rays[part].reshape(-1, 3)
+        distance[part] = scene.distances(centre, way).reshape(bottom - top, -1)
     return distance, rays
 
 
@@ -433,7 +437,7 @@ def _clear(
     indices: Index,
 ) -> Mask:
     """Whether the pixels around surfels show the surface that their tangent planes predict."""
-    distance, rays = depth_map(camera, scene)
+    distance, rays = depth_map(camera, scene, pixels[indices])
     focal_px = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
     return np.asarray(
         matches_tangent_plane(
