@@ -35,6 +35,7 @@ MAX_HALF_FLOAT = 65504.0  # larger numbers are infinite in half precision
 # fraction of dark pixels above which a sample is dark; the rest allows for rounding in
 # the sum of weights
 MIN_DARK_FRACTION = 0.999
+FLOOR = 1e-30  # keeps quotients finite where a picture is black
 # end of the weight (1 - q / FOOTPRINT_REACH)^2, whose second moments are those of a
 # Gaussian
 FOOTPRINT_REACH = 8.0
@@ -434,34 +435,103 @@ def _half_or_nan(number: float) -> np.uint16:
 
 @kernel
 def interpolate(images: Cube, pixels: Matrix, out: Matrix) -> None:
-    """Bilinear values (picture, n) of pictures (picture, h, w) at pixels (n, 2); 0
+    """Bilinear values (n, picture) of pictures (h, w, picture) at pixels (n, 2); 0
     outside, also where these are NaN.
-
-    Positions are the outer loop: where they lie in a picture is computed once for all pictures.
     """
-    count, height, width = images.shape
+    for k in range(len(pixels)):
+        _picture_values(images, pixels[k, 0], pixels[k, 1], out[k])
+
+
+@kernel
+def _picture_values(images: Cube, x: float, y: float, out: Vector) -> None:
+    """Bilinear values (picture,) of pictures (h, w, picture) at one position."""
+    height, width, count = images.shape
+    inside = x >= 0 and x <= width and y >= 0 and y <= height
+    if not inside or width == 0 or height == 0:
+        out[:] = 0.0
+        return
+    column = min(max(x - 0.5, 0.0), width - 1.0)
+    row = min(max(y - 0.5, 0.0), height - 1.0)
+    left = min(int(column), max(width - 2, 0))
+    top = min(int(row), max(height - 2, 0))
+    right = min(left + 1, width - 1)
+    below = min(top + 1, height - 1)
+    a = column - left
+    b = row - top
+    for i in range(count):
+        upper = images[top, left, i] * (1 - a) + images[top, right, i] * a
+        lower = images[below, left, i] * (1 - a) + images[below, right, i] * a
+        out[i] = upper * (1 - b) + lower * b
+
+
+@kernel
+def shift_moments(
+    images: Cube, pixels: Matrix, shifts: Matrix, shade: Matrix, out: Matrix
+) -> None:
+    """Sum of the values of pictures (h, w, picture) at pixels (n, 2) plus each shift
+    (m, 2), of their squares, and of their products with `shade` (n, picture), in `out` (m, 3).
+    """
+    values = np.empty(images.shape[2])
+    for s in range(len(shifts)):
+        total = 0.0
+        square = 0.0
+        product = 0.0
+        for k in range(len(pixels)):
+            x = pixels[k, 0] + shifts[s, 0]
+            _picture_values(images, x, pixels[k, 1] + shifts[s, 1], values)
+            for i in range(len(values)):
+                total += values[i]
+                square += values[i] * values[i]
+                product += values[i] * shade[k, i]
+        out[s, 0] = total
+        out[s, 1] = square
+        out[s, 2] = product
+
+
+@kernel
+def alignment_rows(
+    images: Cube, pixels: Matrix, moves: Cube, shade: Matrix, rows: Cube, rest: Matrix
+) -> None:
+    """Linear equations for the parameters that move pixels so that pictures show a shade.
+
+    The gain of each picture is eliminated: a row is orthogonal to the shade.
+
+    Parameters
+    ----------
+    images, pixels
+        (h, w, picture) and (n, 2).
+    moves
+        (n, 2, 4) change of the pixels by each parameter.
+    shade
+        (n, picture) expected values, in any unit.
+    rows, rest
+        (n, picture, 4) and (n, picture) output: derivatives of the values, and what
+        they lack.
+    """
+    count = images.shape[2]
+    gain = np.zeros(count)
+    along = np.zeros((count, 4))
+    square = np.full(count, FLOOR)
+    values = np.empty((4, count))
     for k in range(len(pixels)):
         x = pixels[k, 0]
         y = pixels[k, 1]
-        if not (
-            x >= 0
-            and x <= width
-            and y >= 0
-            and y <= height
-            and width > 0
-            and height > 0
-        ):
-            out[:, k] = 0.0
-            continue
-        column = min(max(x - 0.5, 0.0), width - 1.0)
-        row = min(max(y - 0.5, 0.0), height - 1.0)
-        left = min(int(column), max(width - 2, 0))
-        top = min(int(row), max(height - 2, 0))
-        right = min(left + 1, width - 1)
-        below = min(top + 1, height - 1)
-        a = column - left
-        b = row - top
+        _picture_values(images, x, y, rest[k])
+        _picture_values(images, x + 0.5, y, values[0])
+        _picture_values(images, x - 0.5, y, values[1])
+        _picture_values(images, x, y + 0.5, values[2])
+        _picture_values(images, x, y - 0.5, values[3])
         for i in range(count):
-            upper = images[i, top, left] * (1 - a) + images[i, top, right] * a
-            lower = images[i, below, left] * (1 - a) + images[i, below, right] * a
-            out[i, k] = upper * (1 - b) + lower * b
+            square[i] += shade[k, i] * shade[k, i]
+            gain[i] += rest[k, i] * shade[k, i]
+            across = values[0, i] - values[1, i]
+            down = values[2, i] - values[3, i]
+            for m in range(4):
+                rows[k, i, m] = across * moves[k, 0, m] + down * moves[k, 1, m]
+                along[i, m] += shade[k, i] * rows[k, i, m]
+    for k in range(len(pixels)):
+        for i in range(count):
+            part = shade[k, i] / square[i]
+            rest[k, i] = gain[i] * part - rest[k, i]
+            for m in range(4):
+                rows[k, i, m] -= along[i, m] * part

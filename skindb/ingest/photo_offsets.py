@@ -16,7 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from skindb.ingest._sample_kernels import block_means, interpolate
+from skindb.ingest._sample_kernels import (
+    FLOOR,
+    alignment_rows,
+    block_means,
+    interpolate,
+    shift_moments,
+)
 from skindb.numerics.statistics import correlation, robust_deviation
 from skindb.types import Float64, Mask
 
@@ -28,15 +34,14 @@ SMALL_STEP = 0.01
 # range of the search for large offsets in radii of the face, and steps per side
 SEARCH_RADII = 0.75
 SEARCH_STEPS = 7
+# of the mean square; smaller ones are rounding
+CONSTANT_VARIANCE = 1e-12
 # robust standard deviations at which the weight of a residual is one half
 ROBUST_SCALE = 2.0
 # of the ratios measured / predicted of a surfel; highlights raise the larger ones
 ALBEDO_QUANTILE = 0.4
 # relative to the median albedo, from brows and nostrils to the forehead
 ALBEDO_RANGE = (0.2, 3.0)
-# px, whose differences are derivatives
-STEPS = ([0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5])
-FLOOR = 1e-30  # keeps quotients finite where a picture is black
 # of the largest irradiance in a view, above which a surfel is compared
 LIT_FRACTION = 0.3
 # of the medians of cameras and lights in turn; three change factors by less than 1 %
@@ -104,14 +109,14 @@ def reduced(image: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
 
 def bilinear(image: Float64, pixels: Float64) -> Float64:
     """Interpolated values (n,) at pixels (n, 2); 0 outside the picture."""
-    return np.asarray(interpolated(image[None], pixels)[0])
+    return np.asarray(interpolated(image[..., None], pixels)[:, 0])
 
 
 def interpolated(images: Float64, pixels: Float64) -> Float64:
-    """Interpolated values (picture, n) of pictures (picture, h, w) at pixels (n, 2); 0
+    """Interpolated values (n, picture) of pictures (h, w, picture) at pixels (n, 2); 0
     outside the pictures.
     """
-    out = np.empty((len(images), len(pixels)))
+    out = np.empty((len(pixels), images.shape[2]))
     interpolate(
         np.ascontiguousarray(images, np.float64),
         np.ascontiguousarray(pixels, np.float64),
@@ -146,14 +151,13 @@ def camera_offset(
     pixels = views[0].pixels[surfels]
     middle = pixels.mean(axis=0)
     radius = float(np.sqrt(((pixels - middle) ** 2).sum(axis=1).mean()))
-    images = np.stack([view.image for view in views])
-    predicted = [
-        np.sqrt(np.maximum(irradiance[view.light][surfels] * albedo[surfels], 0))
-        for view in views
-    ]
+    images = np.stack([view.image for view in views], axis=-1)
+    lights = [view.light for view in views]
+    light = np.ascontiguousarray(irradiance[lights][:, surfels].T)
+    predicted = np.sqrt(np.maximum(light * albedo[surfels, None], 0))
 
     def agreement(places: Float64) -> float:
-        correlations = map(correlation, interpolated(images, places), predicted)
+        correlations = map(correlation, interpolated(images, places).T, predicted.T)
         # the median ignores a light with a wrong position
         return float(np.median([*correlations]))
 
@@ -181,21 +185,24 @@ def camera_offset(
 
 
 def _large_shift(
-    images: Float64, predicted: Sequence[Float64], pixels: Float64, radius: float
+    images: Float64, predicted: Float64, pixels: Float64, radius: float
 ) -> Float64:
     """Shift (2,) px on a coarse grid that agrees best; 0 unless it is clearly better."""
     few = slice(None, None, max(len(pixels) // 2000, 1))
-    thin = np.concatenate([values[few] for values in predicted])
-
-    def agreement(shift: Float64) -> float:
-        return correlation(interpolated(images, pixels[few] + shift).ravel(), thin)
-
+    thin = predicted[few] - predicted[few].mean()
     steps = radius * SEARCH_RADII * np.linspace(-1, 1, 2 * SEARCH_STEPS + 1)
+    # the one in the middle is 0
     shifts = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-    agreements = [agreement(shift) for shift in shifts]
-    best = int(np.argmax(agreements))
-    none = np.zeros(2)
-    return shifts[best] if agreements[best] > agreement(none) + 0.02 else none
+    moments = np.empty((len(shifts), 3))
+    shift_moments(images, np.ascontiguousarray(pixels[few]), shifts, thin, moments)
+    total, square, product = moments.T
+    variance = square - total**2 / thin.size
+    product[variance <= CONSTANT_VARIANCE * square] = 0
+    agreement = product / np.sqrt(np.maximum(variance * (thin**2).sum(), FLOOR**2))
+    best = int(np.argmax(agreement))
+    none = len(shifts) // 2
+    better = agreement[best] > agreement[none] + 0.02
+    return np.asarray(shifts[best if better else none])
 
 
 def moved_pixels(view: ReducedView, offset: Offset) -> Float64:
@@ -250,7 +257,7 @@ def square_root_image(image: NDArray[np.floating[Any]]) -> Float64:
 
 def _gauss_newton(
     images: Float64,
-    predicted: Sequence[Float64],
+    predicted: Float64,
     pixels: Float64,
     moves: Float64,
     start: Float64,
@@ -259,27 +266,13 @@ def _gauss_newton(
     with one gain per picture.
     """
     move = start.copy()
+    count = images.shape[2]
+    rows = np.empty((len(pixels), count, 4))
+    rest = np.empty((len(pixels), count))
     for _ in range(MAX_STEPS):
-        places = pixels + moves @ move
-        right, left, below, above = (
-            interpolated(images, places + step) for step in STEPS
-        )
-        rows = []
-        rest = []
-        for seen, across, down, shade in zip(
-            interpolated(images, places),
-            right - left,
-            below - above,
-            predicted,
-            strict=True,
-        ):
-            square = max(float(shade @ shade), FLOOR)
-            row = across[:, None] * moves[:, 0] + down[:, None] * moves[:, 1]
-            # the gain is eliminated
-            rows.append(row - np.outer(shade, shade @ row) / square)
-            rest.append(float(seen @ shade) / square * shade - seen)
-        matrix = np.concatenate(rows)
-        residual = np.concatenate(rest)
+        alignment_rows(images, pixels + moves @ move, moves, predicted, rows, rest)
+        matrix = rows.reshape(-1, 4)
+        residual = rest.ravel()
         scale = ROBUST_SCALE * float(robust_deviation(residual)) + FLOOR
         weight = 1 / (1 + (residual / scale) ** 2)
         weighted = (matrix * weight[:, None]).T
@@ -325,8 +318,7 @@ def view_factors(
     """
     grey = irradiance.mean(axis=1)
     surfels = view.clear & (grey > LIT_FRACTION * grey.max())
-    planes = np.moveaxis(np.asarray(picture, np.float64), -1, 0)
-    radiance = np.stack([bilinear(plane, pixels[surfels]) for plane in planes], axis=1)
+    radiance = interpolated(np.asarray(picture, np.float64), pixels[surfels])
     return np.asarray(
         np.pi
         * np.median(radiance / (irradiance[surfels] * albedo[surfels, None]), axis=0)

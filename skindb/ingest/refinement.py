@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skindb.format.dome import CameraRecord, DomeRecord
+from skindb.ingest._sample_kernels import FLOOR
 from skindb.ingest.consistency import (
     MIN_SEEN_FRACTION,
     MIN_SURFELS,
     CalibrationCheck,
     Pair,
 )
-from skindb.ingest.photo_offsets import FLOOR, Offset, ReducedView, bilinear
+from skindb.ingest.photo_offsets import Offset, ReducedView, bilinear
 from skindb.types import Float64
 
 ROUNDS = 2  # a third round shifted the photographs of four captures by at most 0.06 mm
