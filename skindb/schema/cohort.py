@@ -8,7 +8,7 @@ from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from types import NoneType
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import xarray as xr
@@ -48,11 +48,30 @@ COLUMN = re.compile(
 )
 
 
+class Values(NamedTuple):
+    """Values of a variable of one take, along its dims."""
+
+    array: NDArray[Any]
+    labels: Mapping[str, Sequence[Any]]  # dim -> labels, if it has some
+
+
 class Source(Protocol):
     """Source of the values of a part; it is pickled into the tasks of a cohort."""
 
-    def read(self, name: str) -> xr.DataArray:
-        """A variable, with its values."""
+    def read(self, name: str) -> Values:
+        """Values of a variable."""
+
+
+def values_of(ds: xr.Dataset, name: str) -> Values:
+    """Values of a variable of a Dataset."""
+    variables = ds.variables
+    variable = variables[name]
+    labels = {
+        str(dim): variables[dim].values.tolist()
+        for dim in variable.dims
+        if dim in variables
+    }
+    return Values(variable.values, labels)
 
 
 @dataclass(frozen=True)
@@ -74,9 +93,9 @@ class Held:
 
     ds: xr.Dataset
 
-    def read(self, name: str) -> xr.DataArray:
-        """A variable of the Dataset."""
-        return self.ds[name]
+    def read(self, name: str) -> Values:
+        """Values of a variable of the Dataset."""
+        return values_of(self.ds, name)
 
     @classmethod
     def part(cls, take: str, coords: Mapping[str, Any], ds: xr.Dataset) -> Part:
@@ -376,17 +395,20 @@ class Stack:
                 out[i] = selected(values, others)
         return out if takes.ndim else out[0]
 
-    def _in_layout(self, values: xr.DataArray) -> NDArray[Any]:
+    def _in_layout(self, values: Values) -> NDArray[Any]:
         """Values of one take in the layout of the cohort."""
         out = _absent(self.variable, self.size)
         indices: list[Any] = []
-        for dim, size in zip(values.dims, self.size, strict=True):
-            if dim in self.places and dim in values.coords:
-                place = self.places[str(dim)]
-                indices.append([place[label] for label in values[dim].values.tolist()])
+        extents = zip(
+            VARIABLES[self.variable].dims, values.array.shape, self.size, strict=True
+        )
+        for dim, length, size in extents:
+            if dim in self.places and dim in values.labels:
+                place = self.places[dim]
+                indices.append([place[label] for label in values.labels[dim]])
             else:
-                indices.append(range(min(values.sizes[dim], size)))
-        inside = values.values[tuple(slice(len(index)) for index in indices)]
+                indices.append(range(min(length, size)))
+        inside = values.array[tuple(slice(len(index)) for index in indices)]
         out[np.ix_(*indices)] = inside
         return out
 

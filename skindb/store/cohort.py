@@ -15,10 +15,12 @@ from skindb.errors import Fault, InputError, input_error, require
 from skindb.schema.cohort import (
     Part,
     Source,
+    Values,
     combine,
     few_names,
     one_take_each,
     take_coords,
+    values_of,
 )
 from skindb.schema.notes import Note, note, note_lines
 from skindb.store.arrays import open_group
@@ -66,9 +68,9 @@ class StoredGroup:
     address: Address
     group: str
 
-    def read(self, name: str) -> xr.DataArray:
+    def read(self, name: str) -> Values:
         """Values of a variable of the group."""
-        return _group(self.address, self.group)[name].compute(scheduler="synchronous")
+        return _read(self.address, self.group, name)
 
 
 @dataclass(frozen=True)
@@ -81,25 +83,29 @@ class StoredSamples:
     capture: Address
     surfels: int
 
-    def read(self, name: str) -> xr.DataArray:
+    def read(self, name: str) -> Values:
         """Values of a variable of the sample or of the dome, or the reflectance samples."""
         if name in DOME:
-            return _group(self.capture, "dome")[name].compute(scheduler="synchronous")
-        sample = _group(self.address, "sample")
+            return _read(self.capture, "dome", name)
         if name != SAMPLES:
-            return sample[name].compute(scheduler="synchronous")
+            return _read(self.address, "sample", name)
+        sample = _group(self.address, "sample")
         index = sample["surfel_index"].values[: self.surfels]
         order = np.argsort(index)
-        values = (
-            _group(self.capture, "samples")[SAMPLES]
-            .isel(surfel=index[order])
-            .compute(scheduler="synchronous")
-        )
+        chosen = _group(self.capture, "samples").isel(surfel=index[order])
+        array, labels = values_of(chosen[[name]].compute(scheduler="synchronous"), name)
         dome = _group(self.capture, "dome")
-        labels = {
-            dim: dome[dim].values for dim in ("light", "camera") if dim in dome.coords
+        named = {
+            dim: dome[dim].values.tolist()
+            for dim in ("light", "camera")
+            if dim in dome.coords
         }
-        return values.isel(surfel=np.argsort(order)).assign_coords(labels)
+        return Values(array[np.argsort(order)], {**labels, **named})
+
+
+def _read(address: Address, group: str, name: str) -> Values:
+    ds = _group(address, group)[[name]]
+    return values_of(ds.compute(scheduler="synchronous"), name)
 
 
 @collection_paused()

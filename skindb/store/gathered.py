@@ -21,7 +21,7 @@ import numpy as np
 import xarray as xr
 
 from skindb.errors import InputError, input_error, require
-from skindb.schema.cohort import TAKE, Held, combine
+from skindb.schema.cohort import TAKE, Held, Values, combine, values_of
 from skindb.schema.variables import VARIABLES
 from skindb.store.bucket import place_at
 from skindb.store.entries import block_keys
@@ -92,11 +92,12 @@ class StoredTables:
     block: Block | None = None  # that holds them too
     index: int = 0  # in the block
 
-    def read(self, name: str) -> xr.DataArray:
+    def read(self, name: str) -> Values:
         """Values of a variable of the tables."""
         if self.block is None:
-            return _tables(self.address)[name]
-        return _opened(self.block)[name][self.index]
+            return values_of(_tables(self.address), name)
+        array, labels = values_of(_opened(self.block), name)
+        return Values(array[self.index], labels)
 
 
 def table_sources(addresses: Iterable[Address]) -> list[StoredTables]:

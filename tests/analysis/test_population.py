@@ -40,7 +40,7 @@ from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.mixture import basis_rows
 from skindb.reflectance.tables import brdf_metric, lookup
 from skindb.schema import dataset
-from skindb.schema.cohort import Part, combine
+from skindb.schema.cohort import Part, Values, combine, values_of
 from skindb.store import Database, StaleWarning
 from skindb.workflow import studies
 
@@ -404,7 +404,7 @@ class _Made:
         self.seed = seed
         self.count = count
 
-    def read(self, name: str) -> xr.DataArray:
+    def read(self, name: str) -> Values:
         rng = np.random.default_rng([self.seed, len(name)])
         make = {
             "dictionary_weight": lambda: rng.gamma(0.3, 0.02, (self.count, 8)),
@@ -415,7 +415,7 @@ class _Made:
             {name: make[name]().astype(np.float32)},
             coords={"dictionary": NAMES} if "dict" in name else {},
         )
-        return found[name]
+        return values_of(found, name)
 
 
 def _lazy_cohort(counts):

@@ -16,7 +16,7 @@ from skindb import workflow
 from skindb.analysis import sample_surfels
 from skindb.errors import InputError
 from skindb.schema import ProbeStatus
-from skindb.schema.cohort import MAX_BLOCK_TAKES, Held, Part, column, combine
+from skindb.schema.cohort import MAX_BLOCK_TAKES, Held, Part, Values, column, combine
 from skindb.store import Database
 from skindb.store.cohort import Address, _group
 
@@ -251,7 +251,7 @@ def test_combine__only_the_selected_takes_are_read():
 
         def read(self, name):
             reads.append(self.number)
-            return xr.DataArray(np.full((2, 3), self.number), dims=("site", "channel"))
+            return Values(np.full((2, 3), self.number), {})
 
     none = {"x": 1}
     parts = [
