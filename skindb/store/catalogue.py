@@ -114,16 +114,7 @@ def _row(lookup: Lookup, take: str) -> dict[str, Any]:
         }
         # whether there is a newer capture than that from which a model was made
         capture = records.get("capture")
-        made_from = [
-            reference["generation"]
-            for reference in model.made_from
-            if reference["kind"] == "capture"
-        ]
-        row["outdated"] = (
-            capture is not None
-            and bool(made_from)
-            and capture.generation not in made_from
-        )
+        row["outdated"] = capture is not None and model.is_outdated(capture)
     return row
 
 

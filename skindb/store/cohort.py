@@ -197,15 +197,12 @@ def _outdated(lookup: Lookup, records: Mapping[str, Record]) -> list[Note]:
     notes = []
     for take in records:
         if lookup.has("capture", take) and lookup.has("model", take):
-            newest = lookup.record("capture", take).generation
-            generations = [
-                reference["generation"]
-                for reference in lookup.record("model", take).made_from
-                if reference["kind"] == "capture"
-            ]
-            if generations and newest not in generations:
-                text = f"its model was made from capture {max(generations)}"
-                text += f", but the newest is {newest}; run skindb fit"
+            newest = lookup.record("capture", take)
+            model = lookup.record("model", take)
+            if model.is_outdated(newest):
+                earlier = max(n for kind, _, n in model.input_keys if kind == "capture")
+                text = f"its model was made from capture {earlier}"
+                text += f", but the newest is {newest.generation}; run skindb fit"
                 notes.append(note(take, text))
     return notes
 
@@ -284,14 +281,11 @@ def _members(
 
 
 def _is_of_current_model(lookup: Lookup, take: str) -> bool:
-    if not lookup.has("model", take):
-        return False
-    current = lookup.record("model", take)
-    models = [
-        (reference["kind"], reference["take"], reference["generation"])
-        for reference in lookup.record("registration", take).made_from
-    ]
-    return ("model", take, current.generation) in models
+    registration = lookup.record("registration", take)
+    return (
+        lookup.has("model", take)
+        and lookup.record("model", take).key in registration.input_keys
+    )
 
 
 def _largest_frame(lookup: Lookup, takes: Sequence[str]) -> tuple[list[str], list[str]]:

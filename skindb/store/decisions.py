@@ -25,7 +25,7 @@ def record_consent(place: Place, subject: str, scope: Iterable[str]) -> Record:
             finding,
             "choose from these",
         )
-    _require_subject(place, subject)
+    require_subject(place, subject)
     with Stage(place, CONSENT, subject) as stage:
         record = stage.commit({"subject": subject, "consent_scope": scopes})
     note_consents(place, [record])
@@ -43,7 +43,7 @@ def consent_history(place: Place, subject: str) -> list[dict[str, Any]]:
         records = snapshot.history(CONSENT, subject)
         sources += [(record, "record") for record in records]
     if not sources:
-        _require_subject(place, subject)
+        require_subject(place, subject)
     return [
         {
             "created": record.created,
@@ -92,7 +92,8 @@ def commit_release(
         return stage.commit({"command": "release", "release": name, "inputs": inputs})
 
 
-def _require_subject(place: Place, subject: str) -> None:
+def require_subject(place: Place, subject: str) -> None:
+    """Raise an `InputError` if the database holds no version of a subject."""
     subjects = Snapshot(place).subjects()
     if subject in subjects:
         return

@@ -12,15 +12,14 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from skindb.schema.consent import CONSENT
-from skindb.store.place import READER_THREADS, Place
-from skindb.store.record import Record, intact_or_none
+from skindb.store.place import Place, in_parallel
+from skindb.store.record import Key, Record, intact_or_none
 
 CATALOGUE = "catalogue"
 CATALOGUE_BLOCK = r"[0-9a-f]{64}\.json"
@@ -68,7 +67,6 @@ CACHED_FIELDS = (
     "admissions",
     "seal",
 )
-Key = tuple[str, str, int]  # kind, take and generation of a record
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,11 +94,6 @@ def collection_paused() -> Iterator[None]:
             gc.enable()
 
 
-def key_of(record: Record) -> Key:
-    """Key of an entry."""
-    return record.kind, record.take, record.generation
-
-
 def trimmed_record(record: Record) -> Record:
     """The record with the parts that are cached."""
     inputs = ("inputs",) if record.kind in KINDS_WITH_INPUTS else ()
@@ -124,9 +117,8 @@ def read_blocks(place: Place) -> dict[str, list[Entry] | None]:
     blocks: dict[str, list[Entry] | None] = {}
     for _ in range(MAX_LISTINGS):
         keys = block_keys(place, CATALOGUE)
-        with ThreadPoolExecutor(READER_THREADS) as pool:
-            entries = pool.map(partial(_read_block, place), keys)
-            blocks = dict(zip(keys, entries, strict=True))
+        entries = in_parallel(partial(_read_block, place), keys)
+        blocks = dict(zip(keys, entries, strict=True))
         if None not in blocks.values():
             break
     return blocks
@@ -161,7 +153,7 @@ def write_blocks(
     of each block, see `Place.replace`.
     """
     # takes together, so that few blocks name a subject
-    rows = sorted(entries, key=lambda entry: (entry.record.take, key_of(entry.record)))
+    rows = sorted(entries, key=lambda entry: (entry.record.take, entry.record.key))
     count = math.ceil(len(rows) / MAX_BLOCK_ROWS)
     written = {}
     for number in range(count):
@@ -170,7 +162,7 @@ def write_blocks(
         content = _content(part)
         key = f"{CATALOGUE}/{hashlib.sha256(content).hexdigest()}.json"
         place.replace(key, content, guard=partial(guard, key))
-        written[key] = [key_of(entry.record) for entry in part]
+        written[key] = [entry.record.key for entry in part]
     return written
 
 

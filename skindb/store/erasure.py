@@ -8,16 +8,16 @@ import errno
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TypeVar
 
 from skindb.errors import InputError, input_error
 from skindb.schema.consent import CONSENT
-from skindb.store.decisions import commit_release
+from skindb.store.decisions import commit_release, require_subject
 from skindb.store.entries import catalogue_blocks_of
 from skindb.store.folder import remove_tree
 from skindb.store.gathered import blocks_of
@@ -26,8 +26,6 @@ from skindb.store.log import Log, committed_logs, takes_below
 from skindb.store.markers import Markers, mark_withdrawn, note_withdrawals, read_markers
 from skindb.store.place import (
     KINDS_OF_ONE_SUBJECT,
-    KINDS_WITHOUT_SUBJECT,
-    READER_THREADS,
     RELEASE,
     STUDY,
     SUMMARY,
@@ -36,6 +34,7 @@ from skindb.store.place import (
     TRANSIENT,
     Place,
     UnavailableError,
+    in_parallel,
     subject_of,
 )
 from skindb.store.record import Record, subjects_of
@@ -312,22 +311,7 @@ def subject_holdings(place: Place, subject: str) -> Holdings:
             "see skindb info",
         )
     if holdings == holdings_of(place, markers):
-        takes = {
-            take
-            for kind, take in takes_below(place, "log")
-            if kind not in KINDS_WITHOUT_SUBJECT
-        }
-        subjects = sorted(
-            {
-                subject_of(take)
-                for take in takes
-                if not markers.is_withdrawn(subject_of(take))
-            }
-        )
-        finding = f"subjects: {', '.join(subjects[:8]) or 'none'}" + (
-            ", ..." if len(subjects) > 8 else ""
-        )
-        raise input_error(subject, rule, finding, "see skindb info")
+        require_subject(place, subject)
     return holdings
 
 
@@ -365,12 +349,7 @@ def _count(place: Place, kind: str, take: str) -> int:
 
 def _every_record(place: Place) -> list[Record]:
     """All readable records, the newest of each kind and take after the others."""
-    with ThreadPoolExecutor(READER_THREADS) as threads:
-        return [
-            record
-            for records in threads.map(Log.readable, committed_logs(place))
-            for record in records
-        ]
+    return list(chain(*in_parallel(Log.readable, committed_logs(place))))
 
 
 def _doomed(records: Iterable[Record], markers: Markers) -> list[Record]:

@@ -26,7 +26,7 @@ from skindb.store.place import (
     TRANSIENT,
     Place,
 )
-from skindb.store.record import Record
+from skindb.store.record import Key, Record
 from skindb.store.stage import remove_version
 from skindb.store.verify import may_have_had_record, partly_removed_records, tombstones
 
@@ -324,27 +324,20 @@ def _old_generations(place: Place, generations: int, now: Clock) -> Iterator[Gar
             str(generations),
             "choose a larger number",
         )
-    listed: dict[tuple[str, str, int], Record] = {}
+    listed: dict[Key, Record] = {}
     waiting: list[Record] = []
     for log in committed_logs(place):
         records, faults = log.faults()
         if faults:  # the inputs that a damaged record names are unknown
             raise InputError(faults)
-        listed |= {
-            (log.kind, log.take, record.generation): record for record in records
-        }
+        listed |= {record.key: record for record in records}
         waiting += records if log.kind in KEPT_KINDS else records[-generations:]
-    stays: set[tuple[str, str, int]] = set()
+    stays: set[Key] = set()
     while waiting:
         record = waiting.pop()
-        key = (record.kind, record.take, record.generation)
-        if key not in stays:
-            stays.add(key)
-            named = [
-                (reference["kind"], reference["take"], reference["generation"])
-                for reference in record.made_from
-            ]
-            waiting += [listed[reference] for reference in named if reference in listed]
+        if record.key not in stays:
+            stays.add(record.key)
+            waiting += [listed[key] for key in record.input_keys if key in listed]
     for (kind, take, generation), record in listed.items():
         if (kind, take, generation) not in stays:
             description = (

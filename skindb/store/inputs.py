@@ -19,7 +19,7 @@ from skindb.store.place import (
     Place,
     subject_of,
 )
-from skindb.store.record import Record, intact_or_none, own_takes
+from skindb.store.record import Record, inputs_in, intact_or_none, own_takes
 
 # kind -> scope that its subjects must consent to when it is committed; a record of
 # consent needs none
@@ -43,7 +43,7 @@ def require_inputs(place: Place, provenance: Mapping[str, Any]) -> list[Record]:
     """
     records = []
     faults = []
-    for reference in _inputs_of(provenance):
+    for reference in inputs_in(provenance):
         title = _name(reference)
         record = _record_of(place, reference)
         if record is None:
@@ -73,7 +73,7 @@ def names_of(
     """
     names = {
         str(reference["take"])
-        for reference in _inputs_of(provenance)
+        for reference in inputs_in(provenance)
         if reference["kind"] not in KINDS_WITHOUT_SUBJECT
     }
     # a release names versions, but has none of their data
@@ -110,7 +110,7 @@ def require_consents(
         return
     of_takes = [
         reference
-        for reference in _inputs_of(provenance)
+        for reference in inputs_in(provenance)
         if reference["kind"] not in KINDS_WITHOUT_SUBJECT
     ]
     subjects = {subject_of(reference["take"]) for reference in of_takes}
@@ -132,12 +132,6 @@ def require_consents(
             )
     if faults:
         raise InputError(faults)
-
-
-def _inputs_of(provenance: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """The versions that a provenance names as inputs; a capture names files instead."""
-    inputs = provenance.get("inputs")
-    return inputs if isinstance(inputs, list) else []
 
 
 def _record_of(place: Place, reference: Mapping[str, Any]) -> Record | None:

@@ -12,7 +12,7 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from typing import Any
@@ -166,7 +166,7 @@ class Log:
             )
         if self.kind not in TRANSIENT:
             self._write_head(record.generation, seal, guard)
-        return Record(**{**asdict(record), "seal": seal})
+        return replace(record, seal=seal)
 
     def remove(self, generation: int) -> None:
         """Remove a record and its version permanently, and leave a tombstone with its seal.

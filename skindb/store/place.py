@@ -8,13 +8,16 @@ import hashlib
 import os
 import re
 from collections.abc import Callable, Hashable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVar
 
 from zarr.abc.store import Store
 
 from skindb.errors import Fault, InputError, input_error
 
+T = TypeVar("T")
+R = TypeVar("R")
 STUDY = "population"  # results of a study of many takes
 RELEASE = "release"  # one version of every take under a name
 CALIBRATION = "calibration"  # of the lights of a dome
@@ -73,6 +76,16 @@ def block_digests(content: bytes | bytearray) -> list[str]:
         hashlib.sha256(view[start : start + BLOCK_BYTES]).hexdigest()
         for start in starts
     ]
+
+
+def in_parallel(function: Callable[[T], R], values: Iterable[T]) -> list[R]:
+    """Results of a function that reads small files, in the order of the values."""
+    pool = ThreadPoolExecutor(READER_THREADS)
+    try:
+        return list(pool.map(function, values))
+    finally:
+        # if a bucket does not answer one request, it does not answer the others
+        pool.shutdown(cancel_futures=True)
 
 
 def subject_of(take: str) -> str:

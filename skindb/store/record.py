@@ -2,6 +2,8 @@
 all validated before they are used.
 """
 
+from __future__ import annotations
+
 import hashlib
 import json
 import re
@@ -48,6 +50,7 @@ FIELDS = {
 DIGEST = re.compile("[0-9a-f]{64}")
 AS_RECORDED = "the record must agree with the attributes of its version"
 Test = Callable[[object], bool]
+Key = tuple[str, str, int]  # kind, take and generation of a version
 MAX_COUNT = 1 << 53  # number of bytes, or of elements along a dim
 
 
@@ -152,9 +155,25 @@ class Record:
 
     @property
     def made_from(self) -> list[dict[str, Any]]:
-        """The versions that the provenance names as inputs; a capture names files instead."""
-        inputs = self.provenance.get("inputs", [])
-        return inputs if isinstance(inputs, list) else []
+        """See `inputs_in`."""
+        return inputs_in(self.provenance)
+
+    @property
+    def key(self) -> Key:
+        """Kind, take and generation."""
+        return self.kind, self.take, self.generation
+
+    @property
+    def input_keys(self) -> list[Key]:
+        """Kind, take and generation of each version that the provenance names as an input."""
+        return [(one["kind"], one["take"], one["generation"]) for one in self.made_from]
+
+    def is_outdated(self, capture: Record) -> bool:
+        """Whether a model was made from earlier captures only than this one."""
+        generations = [
+            number for kind, _, number in self.input_keys if kind == "capture"
+        ]
+        return bool(generations) and capture.generation not in generations
 
     @property
     def title(self) -> str:
@@ -173,6 +192,12 @@ class Record:
             "generation": self.generation,
             "seal": self.seal,
         }
+
+
+def inputs_in(provenance: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The versions that a provenance names as inputs; a capture names files instead."""
+    inputs = provenance.get("inputs")
+    return inputs if isinstance(inputs, list) else []
 
 
 def own_takes(kind: str, take: str) -> set[str]:

@@ -19,10 +19,8 @@ from skindb.errors import Fault, InputError, input_error
 from skindb.schema.consent import CONSENT, consent_scope
 from skindb.store.entries import (
     Entry,
-    Key,
     blocks_to_merge,
     collection_paused,
-    key_of,
     read_blocks,
     trimmed_record,
     write_blocks,
@@ -32,17 +30,17 @@ from skindb.store.markers import Markers, WithdrawnError, read_markers
 from skindb.store.place import (
     KIND,
     KINDS_WITHOUT_SUBJECT,
-    READER_THREADS,
     RELEASE,
     TAKE,
     TRANSIENT,
     Located,
     Place,
     UnavailableError,
+    in_parallel,
     require_text,
     subject_of,
 )
-from skindb.store.record import Record, intact_or_none
+from skindb.store.record import Key, Record, intact_or_none
 
 # kinds of the versions that a release names for each take
 PINNED = ("capture", "model", "registration")
@@ -250,9 +248,9 @@ class Lookup:
         return self._pins is not None and kind in PINNED
 
 
-def list_records(place: Place, kind: str = "") -> dict[tuple[str, str, int], str]:
+def list_records(place: Place, kind: str = "") -> dict[Key, str]:
     """Identity of the file of every record in the log, of one kind or of all kinds."""
-    identities: dict[tuple[str, str, int], str] = {}
+    identities: dict[Key, str] = {}
     for name, identity in place.identities(f"log/{kind}".rstrip("/")).items():
         path = f"{kind}/{name}" if kind else name
         listed_kind, take, file, *_ = [*path.split("/"), "", ""]
@@ -356,7 +354,7 @@ class RecordCache:
         """Add the entries of a block whose files have not changed."""
         added = []
         for entry in entries:
-            key = key_of(entry.record)
+            key = entry.record.key
             if self._files.get(key) == entry.file:
                 added.append(key)
                 head = self._head_texts.get(key[:2], "")
@@ -415,14 +413,7 @@ class RecordCache:
             ]
             if self._entry(*key) is None
         ]
-        pool = ThreadPoolExecutor(READER_THREADS)
-        try:
-            list(
-                pool.map(intact_or_none, [partial(self._read, *key) for key in missing])
-            )
-        finally:
-            # if a bucket does not answer one request, it does not answer the others
-            pool.shutdown(cancel_futures=True)
+        in_parallel(intact_or_none, [partial(self._read, *key) for key in missing])
 
     def save(self) -> None:
         """Write what was read to the cache for the next query if possible, without
@@ -437,7 +428,7 @@ class RecordCache:
             entry
             for entry in map(self._entries.__getitem__, keys)
             if self._markers.admits(entry.record)
-            and listed.get(key_of(entry.record)) == entry.file
+            and listed.get(entry.record.key) == entry.file
         ]
         # for example a read-only folder: the next query reads the log again
         with suppress(OSError, InputError):
@@ -480,7 +471,7 @@ class RecordCache:
             # raises the reason
             return self.snapshot.record(kind, take, generation)
         record = trimmed_record(record)
-        key = key_of(record)
+        key = record.key
         if key in self._files:
             self._entries[key] = Entry(
                 record,

@@ -33,6 +33,7 @@ from skindb.store.place import (
     subject_of,
 )
 from skindb.store.record import (
+    Key,
     Record,
     collect_faults,
     damage_as_fault,
@@ -98,7 +99,7 @@ class Staleness:
     def __init__(self, db: Located, cache: Records | None = None) -> None:
         self._cache = cache
         self._snapshot = Snapshot(db.place)
-        self._known: dict[tuple[str, str, int], tuple[Reason, ...]] = {}
+        self._known: dict[Key, tuple[Reason, ...]] = {}
         self._newest: dict[tuple[str, str], int] = {}
         self._covered: dict[str, bool] = {}
 
@@ -107,7 +108,7 @@ class Staleness:
 
         A version that was made from a release is not superseded by later commits.
         """
-        key = (record.kind, record.take, record.generation)
+        key = record.key
         if key not in self._known:
             # inputs are earlier versions; this ends the recursion in a forged cycle
             self._known[key] = ()

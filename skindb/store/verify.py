@@ -167,9 +167,7 @@ def _input_faults(
     place: Place, records: list[Record], damaged: set[str]
 ) -> list[Fault]:
     """Faults of inputs of other versions that are missing or were replaced, without a tombstone."""
-    seals = {
-        (record.kind, record.take, record.generation): record.seal for record in records
-    }
+    seals = {record.key: record.seal for record in records}
     faults = []
     for record in records:
         for reference in record.made_from:
