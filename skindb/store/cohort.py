@@ -94,13 +94,7 @@ class StoredSamples:
         order = np.argsort(index)
         chosen = _group(self.capture, "samples").isel(surfel=index[order])
         array, labels = values_of(chosen[[name]].compute(scheduler="synchronous"), name)
-        dome = _group(self.capture, "dome")
-        named = {
-            dim: dome[dim].values.tolist()
-            for dim in ("light", "camera")
-            if dim in dome.coords
-        }
-        return Values(array[np.argsort(order)], {**labels, **named})
+        return Values(array[np.argsort(order)], labels)
 
 
 def _read(address: Address, group: str, name: str) -> Values:
