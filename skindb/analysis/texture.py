@@ -146,15 +146,18 @@ def log_albedo(maps: xr.Dataset) -> tuple[Array, Mask]:
     """Log R_d (v, u, 3) of a map, extrapolated to texels without measurements, and the
     mask (v, u) of measured ones.
     """
+    log, measured = _measured_log(maps)
+    if measured.any():
+        log, _ = push_pull(log, measured.astype(np.float32))
+    return log, measured
+
+
+def _measured_log(maps: xr.Dataset) -> tuple[Array, Mask]:
     albedo = maps[variables.TEXEL_DIFFUSE_REFLECTANCE].values
     measured = (maps[variables.TEXEL_COVERAGE].values > COVERED) & np.isfinite(
         albedo
     ).all(axis=-1)
-    log = np.log(np.maximum(np.nan_to_num(albedo, nan=1.0), DARKEST))
-    if not measured.any():
-        return np.zeros_like(log), measured
-    filled, _ = push_pull(log, measured.astype(np.float32))
-    return filled, measured
+    return np.log(np.maximum(np.nan_to_num(albedo, nan=1.0), DARKEST)), measured
 
 
 def decorrelated(log: Array, mean: Array, axes: Array) -> Array:
@@ -163,7 +166,7 @@ def decorrelated(log: Array, mean: Array, axes: Array) -> Array:
 
 
 def _moments(maps: xr.Dataset) -> Moments | None:
-    log, measured = log_albedo(maps)
+    log, measured = _measured_log(maps)
     if not measured.any():
         return None
     inside = log[measured].astype(float)
