@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import multiprocessing
+import os
 import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -37,9 +38,10 @@ def compile_kernels(progress: Progress = silent) -> None:
     progress(COMPILING, 0, len(STEPS))
     call = f"from {__name__} import compile_each; compile_each({thread_count()})"
     # what fails here fails in the fit too, which reports it
-    with subprocess.Popen(
-        [sys.executable, "-c", call], stdout=subprocess.PIPE
-    ) as child:
+    command = [sys.executable, "-c", call]
+    # without threads of BLAS, as a process with threads is not copied safely
+    alone = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    with subprocess.Popen(command, env=alone, stdout=subprocess.PIPE) as child:
         for done, _ in enumerate(child.stdout or (), 1):
             progress(COMPILING, done, len(STEPS))
 
