@@ -490,7 +490,7 @@ class SensorPatterns:
         or are those of another camera.
 
         Those of these views (light, camera) that were not added are read, in the
-        threads of a pool; those that neither were added nor are named are left out.
+        threads of a pool; those that neither were added nor are named are skipped.
 
         Raises
         ------
