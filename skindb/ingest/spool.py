@@ -143,7 +143,7 @@ class Spool:
         """Keep a small array beside the samples; the file is written atomically."""
         content = io.BytesIO()
         np.save(content, array)
-        self._replace(f"{name}.npy", content.getvalue())
+        self._replace(f"{name}.npy", content.getbuffer())
 
     def kept(self, name: str) -> NDArray[Any] | None:
         """An array of `keep`, possibly of an earlier run; None if it is absent."""
@@ -166,7 +166,7 @@ class Spool:
                 )
             # the samples first: the journal must not list views that are not on disk
             os.fsync(self._file)
-            self._replace(JOURNAL, content.getvalue())
+            self._replace(JOURNAL, content.getbuffer())
 
     def restart(self) -> None:
         """Forget all views, but no small array."""
@@ -236,19 +236,22 @@ class Spool:
         self.restart()
 
     def _sealed(self, name: str) -> io.BytesIO | None:
-        """Content that `_replace` wrote under a name; None if it is absent, damaged, or
-        of another run.
+        """Content of `_replace`, behind its seal; None if it is absent, damaged, or of
+        another run.
         """
         path = self.folder / name
         if path.is_symlink() or not path.is_file():
             return None
         sealed = path.read_bytes()
-        content = sealed[SEAL_BYTES:]
-        valid = hmac.compare_digest(sealed[:SEAL_BYTES], self._seal(name, content))
-        return io.BytesIO(content) if valid else None
+        seal = self._seal(name, memoryview(sealed)[SEAL_BYTES:])
+        content = io.BytesIO(sealed)
+        same = hmac.compare_digest(content.read(SEAL_BYTES), seal)
+        return content if same else None
 
-    def _seal(self, name: str, content: bytes) -> bytes:
-        return hmac.digest(self._key, name.encode() + b"\0" + content, "sha256")
+    def _seal(self, name: str, content: memoryview) -> bytes:
+        digest = hmac.new(self._key, name.encode() + b"\0", "sha256")
+        digest.update(content)
+        return digest.digest()
 
     def _close(self) -> None:
         for descriptor in (self._file, self._lock):
@@ -256,10 +259,11 @@ class Spool:
                 os.close(descriptor)
         self._file = self._lock = -1
 
-    def _replace(self, name: str, content: bytes) -> None:
+    def _replace(self, name: str, content: memoryview) -> None:
         temporary = self.folder / f"{uuid.uuid4().hex}.tmp"
         with private_file(temporary).open("wb") as file:
-            file.write(self._seal(name, content) + content)
+            file.write(self._seal(name, content))
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(self.folder / name)
