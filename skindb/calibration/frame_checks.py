@@ -478,7 +478,7 @@ class SensorPatterns:
         if (light, camera) not in self.pairs:
             return
         name = self._dome.cameras[camera].id
-        frame = frames[self._shortest(name)]
+        frame = frames[int(np.argmin(self._mergers[name].seconds))]
         # a sum of integers that single precision holds, in any order
         photograph = frame[:: _pattern_step(frame)].astype(np.float32)
         with self._guard:
@@ -489,8 +489,7 @@ class SensorPatterns:
         """Faults of dark frames that match the photographs of their camera only turned,
         or are those of another camera.
 
-        Those of these views (light, camera) that were not added are read, in the
-        threads of a pool; those that neither were added nor are named are skipped.
+        Photographs of these views (light, camera) that were not added are read.
 
         Raises
         ------
@@ -503,16 +502,11 @@ class SensorPatterns:
         faults = pool.map(self._fault, self._total)
         return [fault for fault in faults if fault is not None]
 
-    def _shortest(self, camera: str) -> int:
-        seconds = self._mergers[camera].seconds
-        return seconds.index(min(seconds))
-
     def _fault(self, camera: str) -> Fault | None:
-        shortest = self._shortest(camera)
+        shortest = int(np.argmin(self._mergers[camera].seconds))
         dark = self._mergers[camera].dark
         assert dark is not None
-        cameras = [x.id for x in self._dome.cameras]
-        count = sum(cameras[c] == camera for _, c in self._added)
+        count = sum(self._dome.cameras[c].id == camera for _, c in self._added)
         mean = self._total[camera] / np.float32(count)
         chosen = np.zeros(mean.shape, bool)
         inner = mean[:, 1:-1]

@@ -51,7 +51,6 @@ from skindb.ingest.groups import (
 from skindb.ingest.lumitexels import (
     Lumitexels,
     Sampler,
-    Views,
     choose_photographs,
     fully_lit,
 )
@@ -296,7 +295,7 @@ class _DomeStages:
         sampler = self._sampler(mergers, check)
         rotations = np.zeros((len(self.dome.cameras), 3))
         if parameters.refine is not False and not self.run.faults:
-            refined = self._refined(check, sampler)
+            refined = self._refined(sampler)
             if refined is not self.dome:
                 rotations = applied_rotations(self.dome, refined)
             self._require_cameras(rotations)
@@ -309,8 +308,7 @@ class _DomeStages:
         lumitexels = attempt(
             self.run.faults,
             lambda: sampler.lumitexels(
-                None if self.run.faults else check,
-                refuse=parameters.calibration == "refuse",
+                check=not self.run.faults, refuse=parameters.calibration == "refuse"
             ),
         )
         if lumitexels is None:
@@ -318,7 +316,7 @@ class _DomeStages:
         if measured and not self.run.faults:
             levels = lumitexels.views
             self.run.faults += sample_faults(self.dome, levels.median, levels.bright)
-        if not lumitexels.sample_count.any():
+        if not lumitexels.view_count.any():
             rule = "a surfel must be lit by a light and seen by a camera"
             cure = "check the crop, poses and positions"
             self.run.faults.append(Fault("samples", rule, "none is", cure))
@@ -327,19 +325,20 @@ class _DomeStages:
         self._note(lumitexels, mergers, intensity)
         return self._labelled(lumitexels, check, visible, rotations)
 
-    def _refined(self, check: CalibrationCheck, sampler: Sampler) -> DomeRecord:
+    def _refined(self, sampler: Sampler) -> DomeRecord:
         """The dome with rotated cameras, or as it is if that is chosen or a photograph
         has a fault.
 
         The photographs that show this are sampled with the cameras as they are, and
         again if the cameras are rotated.
         """
+        check = sampler.check
         choose = self.run.parameters.refine == "auto"
         if choose and (reason := reason_to_skip(check)):
             self._record(reason)
             return self.dome
         held_out = held_out_lights(check) if choose else frozenset[int]()
-        pictures = sampler.pictures(check, pictures_to_judge(check, held_out))
+        pictures = sampler.pictures(pictures_to_judge(check, held_out))
         if sampler.faults:
             return self.dome
         if not choose:
@@ -365,25 +364,18 @@ class _DomeStages:
     ) -> Sampler:
         surfels = self.run.surfels
         parameters = self.run.parameters
-        light_fraction = check.light_visible
-        views = Views(
-            surfels,
-            fully_lit(surfels, light_fraction, self.dome.cameras, soft=parameters.soft),
-            check.clear,
-            check.pixels,
-            light_fraction=light_fraction if parameters.soft == "keep" else None,
-            footprint=parameters.footprint,
-        )
+        cameras = self.dome.cameras
         middle = surfels.position.mean(axis=0)
         return Sampler(
-            self.dome,
-            check.intensity,
-            views,
+            check,
+            fully_lit(surfels, check.light_visible, cameras, soft=parameters.soft),
             mergers,
             self.spool,
             self.pool,
             self.run.report,
             kept=choose_photographs(self.dome, middle, parameters.photographs),
+            soft=parameters.soft == "keep",
+            footprint=parameters.footprint,
         )
 
     def _labelled(

@@ -22,6 +22,8 @@ from skindb.schema import dataset
 from skindb.types import Float64
 
 CHANNELS = {"channel": ["R", "G", "B"]}  # coordinate
+# of the spool
+COUNTS = ("sample_count", "saturated_count", "dark_count", "single_exposure_count")
 
 
 def surfel_group(
@@ -135,10 +137,7 @@ def sample_group(dome: DomeRecord, lumitexels: Lumitexels) -> xr.Dataset:
     """Group "samples"; the store reads the spool shard by shard."""
     variables = {
         "reflectance_sample": lumitexels.sample,
-        "sample_count": lumitexels.sample_count,
-        "saturated_count": lumitexels.saturated_count,
-        "dark_count": lumitexels.dark_count,
-        "single_exposure_count": lumitexels.single_count,
+        **dict(zip(COUNTS, lumitexels.counts, strict=True)),
         "noise_floor": lumitexels.noise_floor,
         "shot_noise": lumitexels.shot_noise,
     }

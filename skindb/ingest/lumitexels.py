@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from concurrent.futures import Executor, Future, wait
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from skindb.calibration.radiance import (
 )
 from skindb.errors import Fault, InputError, attempt, require
 from skindb.format.dome import CameraRecord, DomeRecord
-from skindb.format.frames import Digests, Frame
+from skindb.format.frames import Digests
 from skindb.geometry._mesh_kernels import grown
 from skindb.ingest._sample_kernels import (
     MergedView,
@@ -66,22 +66,7 @@ BILINEAR_NOISE = 4 / 9
 LINEAR_NOISE_FLOOR = 1e-4  # sr^-1; for linear files, whose noise is unknown
 
 
-@dataclass(frozen=True)
-class Views:
-    """Which surfels each light reaches and each camera sees, and where they project to."""
-
-    surfels: SurfelSet
-    lit: Mask  # (n, light) surfels that get samples, see `fully_lit`
-    clear: Mask  # (n, camera)
-    pixels: NDArray[np.float32]  # (n, camera, 2)
-    # (n, light) visible fraction of the disc; divides samples
-    light_fraction: NDArray[np.float16] | None = None
-    # samples are means over the surfel's splat; otherwise interpolated bilinearly
-    footprint: bool = False
-
-
-@dataclass(frozen=True)
-class CameraSampling:
+class CameraSampling(NamedTuple):
     """Where and how one camera samples the surfels, the same under every light."""
 
     surfels: Mask  # (n,) those that it samples
@@ -116,10 +101,8 @@ class Lumitexels:
     """Samples, and the outcomes for all visible pairs of light and camera."""
 
     sample: Any  # (n, light, camera, 3) float16 sr^-1; lazy
-    sample_count: NDArray[np.int32]
-    saturated_count: NDArray[np.int32]
-    dark_count: NDArray[np.int32]
-    single_count: NDArray[np.int32]  # samples from a single exposure
+    # (4, n) usable, saturated, dark, and usable from a single exposure
+    counts: NDArray[np.int32]
     view_count: Index  # (light, camera) samples of each view
     views: ViewLevels
     noise_floor: float  # sr^-1
@@ -163,12 +146,10 @@ class Sampler:
 
     Parameters
     ----------
-    dome
-        Cameras, lights and frames.
-    intensity
-        (light, 3) radiant intensity.
-    views
-        Visibility and projections.
+    check
+        Cameras, lights and frames; what the lights reach and the cameras see.
+    lit
+        (n, light) surfels that get samples, see `fully_lit`.
     mergers
         Frame merger of every camera, by id.
     spool
@@ -178,55 +159,60 @@ class Sampler:
         their total number.
     kept
         (light, camera) pairs whose merged radiance is kept.
+    soft
+        Whether samples are divided by the visible fraction of the light.
+    footprint
+        Whether samples are means over the surfel's splat; otherwise they are
+        interpolated bilinearly.
     faults
         Receives the faults of the views.
     """
 
-    dome: DomeRecord
-    intensity: Float64
-    views: Views
+    check: CalibrationCheck
+    lit: Mask
     mergers: Mapping[str, FrameMerger]
     spool: Spool
     pool: Executor
     progress: Progress = silent
     kept: Collection[Pair] = ()
+    soft: bool = False
+    footprint: bool = False
     faults: list[Fault] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self._levels = ViewLevels.empty(self.spool.done.shape)
         self._sampled = self.spool.done.copy()  # or found to be faulty
-        self._patterns = SensorPatterns(self.dome, self.mergers)
-        cameras = enumerate(self.dome.cameras)
-        call = partial(_camera_sampling, self.views)
-        self._shots = list(self.pool.map(call, *zip(*cameras, strict=True)))
+        self._patterns = SensorPatterns(self.check.dome, self.mergers)
+        cameras = range(len(self.check.dome.cameras))
+        self._shots = list(self.pool.map(self._camera_sampling, cameras))
 
-    def pictures(
-        self, check: CalibrationCheck, pairs: Collection[Pair]
-    ) -> dict[Pair, NDArray[np.float32]]:
+    def pictures(self, pairs: Collection[Pair]) -> dict[Pair, NDArray[np.float32]]:
         """Downsampled photographs of these views, which are sampled unless they are in
         the spool, also of an interrupted run.
         """
-        kept = self._kept_pictures(check, pairs)
+        kept = self._kept(pairs, self._picture_name)
         missing = frozenset(pairs) - kept.keys()
-        self._sample(missing, check)
-        return kept | self._kept_pictures(check, missing)
+        self._sample(missing, pictures=True)
+        return kept | self._kept(missing, self._picture_name)
 
-    def _kept_pictures(
-        self, check: CalibrationCheck, pairs: Iterable[Pair]
-    ) -> dict[Pair, NDArray[np.float32]]:
-        images = {pair: self.spool.kept(_picture_name(check, pair)) for pair in pairs}
+    def _kept(
+        self, pairs: Iterable[Pair], name: Callable[[Pair], str]
+    ) -> dict[Pair, Image]:
+        images = {pair: self.spool.kept(name(pair)) for pair in pairs}
         return {pair: image for pair, image in images.items() if image is not None}
 
-    def lumitexels(
-        self, check: CalibrationCheck | None = None, *, refuse: bool = True
-    ) -> Lumitexels:
+    def _picture_name(self, pair: Pair) -> str:
+        j, c = pair
+        return f"picture-{j}-{c}-{self.check.factor(c)}"
+
+    def lumitexels(self, *, check: bool = True, refuse: bool = True) -> Lumitexels:
         """The samples and counts of all views.
 
         Parameters
         ----------
         check
-            Views of its pairs, and those that show the patterns of the sensors, come
-            first; the calibration and the dark frames are checked by them.
+            Whether the calibration and the dark frames are checked, by views that come
+            first.
         refuse
             Whether a calibration that the photographs contradict is an error.
 
@@ -238,14 +224,14 @@ class Sampler:
         """
         calibration = None
         contradictions = list[Fault]()
-        if check is not None:
-            pictures = self.pictures(check, check.pairs)
+        if check:
+            pictures = self.pictures(self.check.pairs)
             self._sample(self._patterns.pairs)
             done = zip(*np.nonzero(self.spool.done), strict=True)
             self.faults += self._patterns.faults(done, self.pool)
-            calibration = None if self.faults else check.evaluate(pictures)
+            calibration = None if self.faults else self.check.evaluate(pictures)
         if calibration is not None and refuse:
-            contradictions = calibration_faults(self.dome, calibration)
+            contradictions = calibration_faults(self.check.dome, calibration)
         # otherwise hours of sampling would end with the same faults
         if not contradictions:
             self._sample(np.ndindex(self._sampled.shape))
@@ -253,64 +239,62 @@ class Sampler:
             raise InputError(self.faults + contradictions)
         return self._lumitexels(calibration)
 
-    def _sample(
-        self, pairs: Iterable[Pair], check: CalibrationCheck | None = None
-    ) -> None:
-        """Sample those of the views that are not sampled; with a check, keep their
+    def _sample(self, pairs: Iterable[Pair], *, pictures: bool = False) -> None:
+        """Sample those of the views that are not sampled; optionally keep their
         downsampled photographs.
         """
         missing = sorted((j, c) for j, c in pairs if not self._sampled[j, c])
         call = partial(attempt, self.faults)
-        sample = partial(self._sample_view, check)
+        sample = partial(self._sample_view, picture=pictures)
         ended = _in_turn(self.pool, lambda pair: call(partial(sample, *pair)), missing)
         for pair, _ in zip(missing, ended, strict=True):
             self._sampled[pair] = True
             self.progress("sample", int(self._sampled.sum()), self._sampled.size)
 
     def _lumitexels(self, calibration: Calibration | None) -> Lumitexels:
-        surfels = self.views.surfels
-        usable, saturated, dark, single = self.spool.counts
-        photographs = {}
-        for j, c in self.kept:
-            image = self.spool.kept(f"photograph-{j}-{c}")
-            if image is not None:
-                photographs[j, c] = image
-        pixels = _effective_pixels(self.dome, self._shots)
+        check = self.check
+        pixels = np.empty((len(self._shots), len(self.lit)), np.float32)
+        for camera, shot, row in zip(
+            check.dome.cameras, self._shots, pixels, strict=True
+        ):
+            pixel_counts(*shot, camera.height, camera.width, row)
         return Lumitexels(
             sample=self.spool.samples(),
-            sample_count=usable,
-            saturated_count=saturated,
-            dark_count=dark,
-            single_count=single,
+            counts=self.spool.counts,
             view_count=self.spool.views,
             views=self._levels,
-            noise_floor=noise_floor(self.dome, self.intensity, surfels),
-            shot_noise=shot_noise(self.dome, self.intensity, surfels),
-            photographs=photographs,
+            noise_floor=noise_floor(check.dome, check.intensity, check.surfels),
+            shot_noise=shot_noise(check.dome, check.intensity, check.surfels),
+            photographs=self._kept(self.kept, _photograph_name),
             calibration=calibration,
-            noise=sample_noise(self.dome, self.views.pixels, pixels),
+            noise=sample_noise(
+                check.dome, check.pixels, np.ascontiguousarray(pixels.T)
+            ),
         )
 
-    def _sample_view(self, check: CalibrationCheck | None, j: int, c: int) -> None:
-        light = self.dome.lights[j]
-        merger = self.mergers[self.dome.cameras[c].id]
+    def _sample_view(self, j: int, c: int, *, picture: bool) -> None:
+        dome = self.check.dome
+        light = dome.lights[j]
+        merger = self.mergers[dome.cameras[c].id]
         shot = self._shots[c]
         digests: Digests = {}
-        frames = checked_view(self.dome, light.id, merger, digests=digests)
+        frames = checked_view(dome, light.id, merger, digests=digests)
         self._patterns.add(j, c, frames)
-        surfels = shot.surfels & self.views.lit[:, j]
-        is_kept = (j, c) in self.kept
-        merged = _merged(
-            merger, frames, shot, surfels, whole=is_kept or check is not None
-        )
-        radiance, flag, _ = merged
-        if is_kept:
-            _lose_saturated(radiance, flag)
-            self.spool.keep(f"photograph-{j}-{c}", radiance)
-        if check is not None:
-            _lose_saturated(radiance, flag)
-            picture = check.reduce(c, radiance)
-            self.spool.keep(_picture_name(check, (j, c)), picture)
+        surfels = shot.surfels & self.lit[:, j]
+        whole = picture or (j, c) in self.kept
+        height, width, _ = frames[0].shape
+        spans = None
+        if not whole:
+            spans = pixel_spans(surfels, shot.pixels, shot.spread, height, width)
+        usable = np.zeros((height, width), np.uint8)
+        radiance, flag = merger.merge(frames, spans, usable=usable)
+        merged = MergedView(radiance, flag, usable)
+        if whole:
+            radiance[flag == SATURATED] = np.nan
+        if picture:
+            self.spool.keep(self._picture_name((j, c)), self.check.reduce(c, radiance))
+        if (j, c) in self.kept:
+            self.spool.keep(_photograph_name((j, c)), radiance)
         samples, outcome = self._gathered(merged, shot, surfels, j)
         count, lit, median, bright = view_levels(samples, outcome, MAX_SAMPLE)
         levels = self._levels
@@ -318,7 +302,7 @@ class Sampler:
             require(
                 # samples of a strong light may be zero in half precision alone
                 lit or bool((radiance[flag == OK] > 0).any()),
-                f"{self.dome.file}[frames], camera {merger.camera.id}, light {light.id}",
+                f"{dome.file}[frames], camera {merger.camera.id}, light {light.id}",
                 "a frame must be bright where its light reaches the face",
                 f"none at {count} surfels",
                 "copy the frame from the camera again",
@@ -333,38 +317,43 @@ class Sampler:
         self, merged: MergedView, shot: CameraSampling, surfels: Mask, j: int
     ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
         """Bits of the samples (3, n) of a view, and outcome (n,) for each surfel."""
-        views = self.views
-        light = self.dome.lights[j]
+        check = self.check
+        light = check.dome.lights[j]
         out = np.empty((3, len(surfels)), np.uint16)
         outcome = np.empty(len(surfels), np.uint8)
         light_fraction = np.zeros(0, np.float32)
-        if views.light_fraction is not None:
-            light_fraction = views.light_fraction[:, j].astype(np.float32)
+        if self.soft:
+            light_fraction = check.light_visible[:, j].astype(np.float32)
         gather(
             merged,
             surfels,
             light_fraction,
             shot.pixels,
             shot.spread,
-            views.surfels.position,
-            views.surfels.normal,
+            check.surfels.position,
+            check.surfels.normal,
             PointLight(
-                light.position, light.axis, float(light.falloff), self.intensity[j]
+                light.position, light.axis, float(light.falloff), check.intensity[j]
             ),
             out,
             outcome,
         )
         return out, outcome
 
+    def _camera_sampling(self, c: int) -> CameraSampling:
+        check = self.check
+        camera = check.dome.cameras[c]
+        surfels = check.clear[:, c] & _frontal(camera, check.surfels)
+        spread = np.zeros((0, 3), np.float32)
+        if self.footprint:
+            spread = footprints(check.surfels, camera)
+            wide = spread[:, [0, 2]].max(axis=1) > MAX_CLEAR_FOOTPRINT_PX**2
+            surfels &= ~(wide & grown(check.surfels.faces, ~check.clear[:, c]))
+        return CameraSampling(surfels, np.ascontiguousarray(check.pixels[:, c]), spread)
 
-def _picture_name(check: CalibrationCheck, pair: Pair) -> str:
-    j, c = pair
-    return f"picture-{j}-{c}-{check.factor(c)}"
 
-
-def _lose_saturated(radiance: Image, flag: NDArray[np.uint8]) -> None:
-    """Set saturated pixels to NaN."""
-    radiance[flag == SATURATED] = np.nan
+def _photograph_name(pair: Pair) -> str:
+    return "photograph-{}-{}".format(*pair)
 
 
 def footprints(surfels: SurfelSet, camera: CameraRecord) -> NDArray[np.float32]:
@@ -388,48 +377,6 @@ def footprints(surfels: SurfelSet, camera: CameraRecord) -> NDArray[np.float32]:
     spread[spread[:, [0, 2]].max(axis=1) < MIN_SPLAT_VARIANCE_PX2] = np.nan
     pixel = np.array([PIXEL_VARIANCE_PX2, 0, PIXEL_VARIANCE_PX2])
     return np.asarray(spread + pixel, np.float32)
-
-
-def _camera_sampling(views: Views, c: int, camera: CameraRecord) -> CameraSampling:
-    surfels = views.clear[:, c] & _frontal(camera, views.surfels)
-    spread = np.zeros((0, 3), np.float32)
-    if views.footprint:
-        spread = footprints(views.surfels, camera)
-        wide = spread[:, [0, 2]].max(axis=1) > MAX_CLEAR_FOOTPRINT_PX**2
-        surfels &= ~(wide & grown(views.surfels.faces, ~views.clear[:, c]))
-    return CameraSampling(surfels, np.ascontiguousarray(views.pixels[:, c]), spread)
-
-
-def _effective_pixels(
-    dome: DomeRecord, shots: Sequence[CameraSampling]
-) -> NDArray[np.float32]:
-    """Effective number of pixels (n, camera) that a sample averages; NaN where a camera
-    takes no sample.
-    """
-    out = np.empty((len(shots), len(shots[0].surfels)), np.float32)
-    for camera, shot, row in zip(dome.cameras, shots, out, strict=True):
-        pixel_counts(
-            shot.surfels, shot.pixels, shot.spread, camera.height, camera.width, row
-        )
-    return np.ascontiguousarray(out.T)
-
-
-def _merged(
-    merger: FrameMerger,
-    frames: list[Frame],
-    shot: CameraSampling,
-    surfels: Mask,
-    *,
-    whole: bool,
-) -> MergedView:
-    """Radiance, flags and usable exposures of a view, or of the pixels that surfels need."""
-    height, width, _ = frames[0].shape
-    spans = None
-    if not whole:
-        spans = pixel_spans(surfels, shot.pixels, shot.spread, height, width)
-    usable = np.zeros((height, width), np.uint8)
-    radiance, flag = merger.merge(frames, spans, usable=usable)
-    return MergedView(radiance, flag, usable)
 
 
 def _in_turn(pool: Executor, call: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:

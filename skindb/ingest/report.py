@@ -169,12 +169,12 @@ def describe_samples(
 
     Also the fraction of the samples that come from a single exposure.
     """
-    count = lumitexels.sample_count
+    count = lumitexels.counts[0]
     views = lumitexels.view_count
     parts = {WHOLE_SURFACE: _quantiles(count)}
     for name, region in zip(surfels.region_names, surfels.region.T, strict=True):
         parts[name] = _quantiles(count[region])
-    single = float(lumitexels.single_count.sum() / max(count.sum(), 1))
+    single = float(lumitexels.counts[3].sum() / max(count.sum(), 1))
     cameras = [camera.id for camera in dome.cameras]
     lights = zip(dome.lights, views.sum(axis=1), strict=True)
     return {

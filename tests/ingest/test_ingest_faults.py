@@ -31,8 +31,9 @@ from skindb.format.folder import read_capture
 from skindb.format.frames import FrameKind
 from skindb.format.sensor import UNKNOWN_ELECTRONS, SensorRecord
 from skindb.geometry.rays import RayScene
+from skindb.ingest.consistency import CalibrationCheck
 from skindb.ingest.groups import dome_group, sample_group, surfel_group
-from skindb.ingest.lumitexels import Sampler, Views
+from skindb.ingest.lumitexels import Sampler
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import build_surfels, camera_visibility
 
@@ -86,10 +87,10 @@ def lumitexels_of(dome, surfels, folder, *, footprint):
         share, clear, pixels = camera_visibility(
             surfels, dome.cameras, RayScene(surfels.position, surfels.faces), pool
         )
-        views = Views(
-            surfels, np.ones((n, shape[0]), bool), clear, pixels, footprint=footprint
-        )
-        found = Sampler(dome, intensity, views, mergers, spool, pool).lumitexels()
+        light = np.ones((n, shape[0]), np.float16)
+        check = CalibrationCheck(dome, surfels, light, clear, pixels, intensity)
+        sampler = Sampler(check, light > 0, mergers, spool, pool, footprint=footprint)
+        found = sampler.lumitexels(check=False)
         groups = {
             "samples": sample_group(dome, found).compute(),
             "surfels": surfel_group(

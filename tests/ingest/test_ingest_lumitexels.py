@@ -13,11 +13,11 @@ from skindb.format.folder import read_capture
 from skindb.geometry.mesh import vertex_areas
 from skindb.geometry.rays import RayScene
 from skindb.ingest.capture import MAX_THREADS
+from skindb.ingest.consistency import CalibrationCheck
 from skindb.ingest.lumitexels import (
     LINEAR_NOISE_FLOOR,
     PIXEL_VARIANCE_PX2,
     Sampler,
-    Views,
     _in_turn,
     choose_photographs,
     footprints,
@@ -149,11 +149,19 @@ def sampled(dome, surfels, folder, *, share=None, lit=None, footprint=False):
         _, clear, pixels = camera_visibility(
             surfels, dome.cameras, RayScene(surfels.position, surfels.faces), pool
         )
-        views = Views(
-            surfels, lit, clear, pixels, light_fraction=share, footprint=footprint
-        )
+        soft = np.ones(lit.shape, np.float16) if share is None else share
         intensity = np.tile(INTENSITY, (shape[0], 1))
-        found = Sampler(dome, intensity, views, mergers, spool, pool).lumitexels()
+        check = CalibrationCheck(dome, surfels, soft, clear, pixels, intensity)
+        sampler = Sampler(
+            check,
+            lit,
+            mergers,
+            spool,
+            pool,
+            soft=share is not None,
+            footprint=footprint,
+        )
+        found = sampler.lumitexels(check=False)
         return clear, replace(found, sample=found.sample.compute())
 
 
@@ -161,7 +169,7 @@ def test_sampler__kept_soft_edges_are_divided_by_the_share(capture, surfels, tmp
     share = np.full((len(surfels.position), 4), 0.5, np.float16)
     _, plain = sampled(capture.dome, surfels, tmp_path / "a")
     _, soft = sampled(capture.dome, surfels, tmp_path / "b", share=share)
-    assert plain.sample_count.sum() > 1000
+    assert plain.counts[0].sum() > 1000
     # two roundings
     np.testing.assert_allclose(
         soft.sample, 2 * plain.sample.astype(np.float64), rtol=2**-10
@@ -201,9 +209,9 @@ def test_describe_samples__one_camera_one_light_and_none(capture, surfels, tmp_p
         1,
         [],
     )
-    assert said["cameras"] == {"c0": found.sample_count.sum()}
+    assert said["cameras"] == {"c0": found.counts[0].sum()}
     assert said["parts"]["all"]["seen"] == pytest.approx(
-        (found.sample_count > 0).mean(), abs=1e-4
+        (found.counts[0] > 0).mean(), abs=1e-4
     )
     _, found = sampled(
         dome, surfels, tmp_path / "b", lit=np.zeros((len(surfels.position), 1), bool)
@@ -234,8 +242,8 @@ def test_sampler__counts_samples_of_a_single_exposure(capture_folder, tmp_path):
             frame = np.full((64, 72, 3), BLACK + value, np.uint16)
             save(capture_folder / f"dome/frames/{exposure}/l0_c0.png", frame)
         _, found = sampled(dome, surfels, tmp_path / str(short))
-        assert found.sample_count.sum() > 100
-        np.testing.assert_array_equal(found.single_count, expected * found.sample_count)
+        assert found.counts[0].sum() > 100
+        np.testing.assert_array_equal(found.counts[3], expected * found.counts[0])
         said = sample_lines(describe_samples(found, surfels, dome))[0]
         assert said.endswith("; 100.0% of the samples come from a single exposure") == (
             expected == 1
@@ -264,10 +272,10 @@ def test_sampler__counts_what_is_lost(capture_folder, tmp_path):
     assert np.isnan(store[:, 0, 1]).all()
     both = clear.all(axis=1) & (surfels.normal[:, 2] > 0.8)
     assert both.any()
-    assert (found.saturated_count[both] == 1).all()
-    assert (found.dark_count[both] >= 1).all()
+    assert (found.counts[1][both] == 1).all()
+    assert (found.counts[2][both] >= 1).all()
     np.testing.assert_array_equal(
-        found.sample_count, np.isfinite(store).all(-1).sum((1, 2))
+        found.counts[0], np.isfinite(store).all(-1).sum((1, 2))
     )
 
 
