@@ -11,6 +11,7 @@ import gc
 import hashlib
 import json
 import math
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -116,7 +117,10 @@ def read_blocks(place: Place) -> dict[str, list[Entry] | None]:
     """Key of every block -> its entries; None if it is damaged."""
     blocks: dict[str, list[Entry] | None] = {}
     for _ in range(MAX_LISTINGS):
-        keys = block_keys(place, CATALOGUE)
+        listed = block_keys(place, CATALOGUE)
+        keys = [
+            key for key in listed if re.fullmatch(f"{CATALOGUE}/{CATALOGUE_BLOCK}", key)
+        ]
         entries = in_parallel(partial(_read_block, place), keys)
         blocks = dict(zip(keys, entries, strict=True))
         if None not in blocks.values():
@@ -125,11 +129,14 @@ def read_blocks(place: Place) -> dict[str, list[Entry] | None]:
 
 
 def catalogue_blocks_of(place: Place, is_named: Callable[[str], bool]) -> list[str]:
-    """Blocks that may name a subject for whom `is_named` is true."""
+    """Blocks, and foreign files beside them, that may name a subject for whom `is_named`
+    is true.
+    """
+    blocks = read_blocks(place)
     return [
         key
-        for key, entries in read_blocks(place).items()
-        if entries is None
+        for key in block_keys(place, CATALOGUE)
+        if (entries := blocks.get(key)) is None
         or any(is_named(name) for entry in entries for name in entry.record.subjects)
     ]
 

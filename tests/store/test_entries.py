@@ -72,10 +72,23 @@ def test_erase__removes_only_the_blocks_with_the_subject(db):
     assert db.verify() == []
 
 
+def test_save__foreign_files_are_left_to_verify(db):
+    foreign = db.root / "catalogue/notes.txt"
+    foreign.parent.mkdir()
+    foreign.write_text("B2")
+    db.table()
+    commit(db.root, take="A1", **SCOPE)
+    db.table()
+    assert foreign.exists()
+    assert ["notes.txt" in str(fault) for fault in db.verify()] == [True]
+    erase(db.place, "B2")
+    assert not foreign.exists()
+
+
 def test_read_blocks__that_another_query_merges_meanwhile(db):
     db.table()
     [key] = entries.block_keys(db.place, "catalogue")
-    listings = [["catalogue/merged.json", key], [key]]
+    listings = [[f"catalogue/{'0' * 64}.json", key], [key]]
     with mock.patch.object(entries, "block_keys", side_effect=listings):
         [rows] = entries.read_blocks(db.place).values()
     assert [row.record.take for row in rows] == ["A1", "B2", "C3", "D4"]
