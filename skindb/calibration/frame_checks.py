@@ -19,7 +19,6 @@ from skindb.calibration.radiance import (
     relative_exposure,
 )
 from skindb.errors import Fault, InputError
-from skindb.format._frame_kernels import finite_range
 from skindb.format.dome import DomeRecord
 from skindb.format.fields import MAX_MAGNITUDE
 from skindb.format.frames import Digests, Frame, read_frame
@@ -270,7 +269,15 @@ def _linear_fault(place: str, frame: Frame) -> Fault | None:
     """Fault of merged radiance that is negative or constant; zero is allowed, for
     lights behind the face.
     """
-    low, high, positive = _finite_range(frame)
+    values = frame
+    if (
+        frame.dtype == np.float16
+    ):  # which is within the limit; some pixels show the rest
+        values = _thinned(frame).astype(np.float32)
+    finite = values[np.isfinite(values)]
+    low = finite.min(initial=np.inf)
+    high = finite.max(initial=-np.inf)
+    positive = np.count_nonzero(finite > 0) / max(values.size, 1)
     rule = "an OpenEXR frame must hold the radiance of a photograph"
     if not low <= high:
         finding = "no finite value"
@@ -284,22 +291,6 @@ def _linear_fault(place: str, frame: Frame) -> Fault | None:
     else:
         return None
     return Fault(place, rule, finding, "merge the exposures of this view again")
-
-
-def _finite_range(frame: Frame) -> tuple[float, float, float]:
-    """Smallest and largest finite value of floats, infinite ones if there is none, and
-    the fraction of positive values.
-    """
-    integer = np.dtype(f"i{frame.dtype.itemsize}")
-    sign = int(np.iinfo(integer).max)
-    infinite = int(np.array(np.inf, frame.dtype).view(integer))
-    bits = np.ascontiguousarray(frame).view(integer).reshape(-1)
-    *ends, positive = finite_range(bits, sign, infinite)
-    low, high = (
-        float(np.array(end if end >= 0 else end ^ sign, integer).view(frame.dtype))
-        for end in ends
-    )
-    return low, high, positive / max(bits.size, 1)
 
 
 def highest_value(merger: FrameMerger, frames: Sequence[Frame]) -> tuple[float, bool]:

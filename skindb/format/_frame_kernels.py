@@ -1,15 +1,13 @@
-"""Kernels of frames: from the inflated bytes of OpenEXR and PNG to values; their range."""
+"""Kernels of frames: from the inflated bytes of OpenEXR and PNG to values."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.jit import kernel
 from skindb.types import ByteMatrix, ByteVector, IntVector
 
 Halves = np.ndarray[tuple[int, int, int], np.dtype[np.uint16]]  # bits of half floats
-Bits = NDArray[np.signedinteger]  # int16 or int32, the bits of half or single floats
 
 
 @kernel
@@ -108,34 +106,3 @@ def undo_filters(content: ByteMatrix, step: int, swap: int, out: ByteMatrix) -> 
         else:
             return False
     return True
-
-
-@kernel
-def finite_range(bits: Bits, sign: int, infinite: int) -> tuple[int, int, int]:
-    """Smallest and largest finite value of floats, and the number of positive ones.
-
-    Values are signed integers with the bits of the floats. They are compared, and
-    returned, with the bits of negative ones inverted except for the sign, which gives
-    them the order of the floats. The smallest is larger than the largest if no value is
-    finite.
-
-    Parameters
-    ----------
-    bits
-        (n,) the values.
-    sign
-        All bits except for that of the sign.
-    infinite
-        Bits of infinity.
-    """
-    low = np.int32(infinite)
-    high = np.int32(-infinite - 1)
-    positive = np.int32(0)
-    for i in range(bits.shape[0]):
-        value = np.int32(bits[i])
-        ordered = np.int32(value ^ ((value >> 31) & np.int32(sign)))
-        finite = (value & np.int32(infinite)) != np.int32(infinite)
-        low = min(low, ordered if finite else np.int32(infinite))
-        high = max(high, ordered if finite else np.int32(-infinite - 1))
-        positive += np.int32(finite and ordered > 0)
-    return int(low), int(high), int(positive)

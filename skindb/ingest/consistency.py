@@ -231,9 +231,7 @@ class CalibrationCheck:
 
     def cosine(self, camera: CameraRecord) -> Float64:
         """Cosine (n,) between the normals of the surfels and the direction to the camera."""
-        way = camera.centre - self._position
-        length = np.linalg.norm(way, axis=1)
-        return np.asarray(np.einsum("ni,ni->n", way, self._normal) / length)
+        return self.surfels.cosine(camera, self.compared)
 
     def _projected_area(self, camera: CameraRecord) -> Float64:
         """Area (n,) [mm2] of the surfels, projected towards the camera."""

@@ -458,8 +458,7 @@ def choose_photographs(dome: DomeRecord, middle: Float64, count: int) -> list[Pa
 
 def _frontal(camera: CameraRecord, surfels: SurfelSet) -> Mask:
     """Where (n,) a view is steep enough for a pixel to cover little of the surface."""
-    way = camera.centre - surfels.position
-    cosine = np.einsum("ni,ni->n", way, surfels.normal) / np.linalg.norm(way, axis=1)
+    cosine = surfels.cosine(camera)
     width = camera.pixel_width(surfels.position.mean(axis=0))
     return np.asarray(cosine >= max(MIN_COSINE_CAMERA, width / MAX_SMEAR_MM))
 

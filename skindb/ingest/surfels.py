@@ -70,6 +70,12 @@ class SurfelSet:
     region: Mask  # (n, region)
     uv_weights: str  # weights that uv were computed with: "intrinsic" or "mean_value"
 
+    def cosine(self, camera: CameraRecord, part: slice = slice(None)) -> Float64:
+        """Cosine (n,) between normals and the direction to the camera."""
+        way = camera.centre - self.position[part]
+        cosine = np.einsum("ni,ni->n", way, self.normal[part])
+        return np.asarray(cosine / np.linalg.norm(way, axis=1))
+
     def spacing(self) -> float:
         """Distance [mm] of neighbours in an even lattice of the same density."""
         return lattice_spacing(float(self.area.mean()))

@@ -29,7 +29,6 @@ from spoil import D, P, edit, put
 
 from skindb.calibration.frame_checks import (
     SensorPatterns,
-    _finite_range,
     highest_value,
     level_notes,
     view_faults,
@@ -658,16 +657,22 @@ def test_ingest_capture__dark_frames_upside_down_are_refused(capture_folder, tmp
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
-def test_finite_range__as_numpy(dtype):
-    rng = np.random.default_rng(1)
-    for low, high in ((-3, 5), (1, 2), (-2, -1), (0, 0)):
-        frame = rng.uniform(low, high, (5, 7, 3)).astype(dtype)
-        frame[0, 0] = np.nan, np.inf, -np.inf
-        frame[0, 1] = -np.nan
-        finite = frame[np.isfinite(frame)]
-        assert _finite_range(frame) == (
-            finite.min(),
-            finite.max(),
-            (finite > 0).sum() / frame.size,
-        )
-    assert _finite_range(np.full((2, 2, 3), np.nan, dtype)) == (np.inf, -np.inf, 0)
+def test_view_faults__of_merged_radiance(pristine, dtype):
+    dome = read_capture(pristine).dome
+    camera = dome.cameras[0]
+    kind = replace(camera.sensor.kind, bits=0)
+    merger = FrameMerger(
+        replace(camera, sensor=replace(camera.sensor, kind=kind)), (1.0,)
+    )
+    noise = np.random.default_rng(1).normal(0, 1, (400, 300, 3)).astype(dtype)
+    noise[0, 0] = np.nan, np.inf, -np.inf
+    for frame, finding in (
+        (noise, None),
+        (np.full_like(noise, 3), "3 everywhere"),
+        (np.zeros_like(noise), None),
+        (-abs(noise), "nearly all negative"),
+        (np.full_like(noise, np.nan), "no finite value"),
+    ):
+        faults = view_faults(dome, next(iter(LIGHTS)), merger, [frame])
+        assert len(faults) == (finding is not None)
+        assert all(finding in fault.found for fault in faults)
