@@ -21,6 +21,7 @@ class ActiveSetMemory(NamedTuple):
     """Memory for `active_set` of m columns; each thread needs its own."""
 
     factor: Matrix  # (m, m) Cholesky factor of the active columns
+    forward: Vector  # (m,) inverse of the factor times b
     solution: Vector  # (m,) unconstrained minimum on the active columns
     gradient: Vector  # (m,) b - G x
     active: IntVector  # (m,) the active columns, in the order of the factor
@@ -36,6 +37,7 @@ def active_set_memory(m: int) -> ActiveSetMemory:
         np.zeros((m, m)),
         np.zeros(m),
         np.zeros(m),
+        np.zeros(m),
         np.empty(m, np.int64),
         np.zeros(m, np.bool_),
         np.zeros(m, np.bool_),
@@ -45,36 +47,55 @@ def active_set_memory(m: int) -> ActiveSetMemory:
 @kernel
 def factor(G: Matrix, active: IntVector, begin: int, k: int, L: Matrix) -> int:
     """Extend the Cholesky factor of G on `active` from position `begin` to k; returns
-    the first bad pivot, or -1.
+    the first bad pivot, or -1. The diagonal holds the reciprocals of the pivots.
     """
     for a in range(begin, k):
+        i = active[a]
+        pivot = G[i, i]
         for c in range(a):
-            t = G[active[a], active[c]]
-            for q in range(c):
-                t -= L[a, q] * L[c, q]
-            L[a, c] = t / L[c, c]
-        t = G[active[a], active[a]]
+            L[a, c] = G[i, active[c]]
         for q in range(a):
-            t -= L[a, q] * L[a, q]
-        if t <= MIN_PIVOT:
+            t = L[a, q] * L[q, q]
+            L[a, q] = t
+            pivot -= t * t
+            for c in range(
+                q + 1, a
+            ):  # independent, unlike the terms of a scalar product
+                L[a, c] -= t * L[c, q]
+        if pivot <= MIN_PIVOT:
             return a
-        L[a, a] = math.sqrt(t)
+        L[a, a] = 1.0 / math.sqrt(pivot)
     return -1
+
+
+@kernel
+def _solve_forward(
+    L: Matrix, b: Vector, active: IntVector, begin: int, k: int, y: Vector
+) -> None:
+    """Extend L^-1 b on the active columns from position `begin` to k."""
+    for a in range(begin, k):
+        t = b[active[a]]
+        for q in range(a):
+            t -= L[a, q] * y[q]
+        y[a] = t * L[a, a]
+
+
+@kernel
+def _solve_backward(L: Matrix, y: Vector, k: int, z: Vector) -> None:
+    """Write L'^-1 y to z."""
+    for a in range(k):
+        z[a] = y[a]
+    for a in range(k - 1, -1, -1):
+        z[a] *= L[a, a]
+        for q in range(a):
+            z[q] -= L[a, q] * z[a]
 
 
 @kernel
 def solve(L: Matrix, b: Vector, active: IntVector, k: int, z: Vector) -> None:
     """Write to z the inverse of the factored matrix times b on the active columns."""
-    for a in range(k):
-        t = b[active[a]]
-        for q in range(a):
-            t -= L[a, q] * z[q]
-        z[a] = t / L[a, a]
-    for a in range(k - 1, -1, -1):
-        t = z[a]
-        for q in range(a + 1, k):
-            t -= L[q, a] * z[q]
-        z[a] = t / L[a, a]
+    _solve_forward(L, b, active, 0, k, z)
+    _solve_backward(L, z, k, z)
 
 
 @kernel
@@ -278,9 +299,10 @@ def active_set(
     L = memory.factor
     z = memory.solution
     active = memory.active
-    # active columns, those the factor holds, iterations
+    # active columns, those the factor holds, those that `forward` holds, iterations
     k = _first_columns(x, memory)
     valid = 0
+    solved = 0
     count = 0
     entering = -1
     warm = k > 0
@@ -296,6 +318,7 @@ def active_set(
         warm = False
         while True:
             count += 1
+            solved = min(solved, valid)
             collinear = factor(G, active, valid, k, L)
             if collinear >= 0:
                 k, valid, dropped = _drop_collinear(
@@ -305,7 +328,9 @@ def active_set(
                     break
                 continue
             valid = k
-            solve(L, b, active, k, z)
+            _solve_forward(L, b, active, solved, k, memory.forward)
+            _solve_backward(L, memory.forward, k, z)
+            solved = k
             step = _feasible_step(active, k, x, z)
             if step == math.inf:
                 _move_to_minimum(k, x, memory)
