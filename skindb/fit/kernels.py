@@ -16,22 +16,24 @@ from skindb.fit.model import COMPILING
 from skindb.fit.normals import METHODS, surfel_normals
 from skindb.jit import is_stored
 from skindb.reflectance._block_kernels import fit_block, judge_block
+from skindb.reflectance._ggx_kernels import fit_ggx, judge_ggx
 from skindb.reflectance._joint_kernels import fit_jointly
+from skindb.reflectance.ggx import GGX
 from skindb.reflectance.joint import refine_block
 from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.model import Block, Comparison, FitRequest, Judgement
 from skindb.reflectance.separation import separate_diffuse
 from skindb.types import Progress, silent
 
-# of a fit by a mixture, the longest first
-STEPS = ("mixture", "joint", "diffuse", "normals")
+STEPS = ("mixture", "joint", "diffuse", "normals", "ggx")  # the longest first
 
 
 def compile_kernels(progress: Progress = silent) -> None:
-    """Compile the kernels that usual fits spend the most time to compile, where they are
-    not stored yet; the others are compiled at their first use.
+    """Compile the kernels that fits spend the most time to compile, where they are not
+    stored yet; the others are compiled at their first use.
     """
-    if all(is_stored(kernel) for kernel in (fit_jointly, fit_block, judge_block)):
+    kernels = (fit_jointly, fit_block, judge_block, fit_ggx, judge_ggx)
+    if all(is_stored(kernel) for kernel in kernels):
         return
     progress(COMPILING, 0, len(STEPS))
     call = f"from {__name__} import compile_each; compile_each({thread_count()})"
@@ -67,8 +69,9 @@ def compile_step(step: str) -> str:
             refine_block(block, comparison, scan_normal=none, scan_error=1.0)
         case "diffuse":
             separate_diffuse(block, np.zeros((0, 2)), eta=1.3)
-        case "mixture":
-            model = Mixture.unfitted(FitRequest(1.3, 0.0, "perceptual", 16, 4))
+        case "mixture" | "ggx":
+            kind = Mixture if step == "mixture" else GGX
+            model = kind.unfitted(FitRequest(1.3, 0.0, "perceptual", 16, 4))
             model.fit(block, comparison)
             model.judge(block, comparison, judgement)
         case "normals":
