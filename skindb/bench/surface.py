@@ -24,7 +24,7 @@ from skindb.reflectance.dictionary import (
     embedded_dictionary,
 )
 from skindb.reflectance.mixture import Mixture, basis_rows
-from skindb.reflectance.model import Block, Comparison, SurfaceFit
+from skindb.reflectance.model import Block, Comparison, Judgement, SurfaceFit
 from skindb.reflectance.reduction import reduce_dictionary
 from skindb.reflectance.tables import brdf_metric, lookup
 from skindb.types import Array
@@ -298,6 +298,13 @@ def refit_curves(quick: bool) -> list[Curve]:
     for mode in ("linear", "perceptual"):
         seconds, fit = _fit(samples, four, mode)
         measured.append((f"skindb {mode}", seconds, fit.parameters))
+    surfels = len(samples.offsets) - 1
+    comparison = Comparison("linear", ETA, NOISE_FLOOR_SURFACE, MIN_SAMPLES)
+    errors = Judgement(np.full((surfels, 3), 0.01), np.full(surfels, 0.5))
+    judge = partial(four.judge, samples.block, comparison, errors)
+    judge()  # compiles
+    seconds, judged = cpu_time(judge, surfels)
+    measured.append(("skindb with errors, linear", seconds, judged.parameters))
     results = []
     for name, seconds, weight in measured:
         point = Point(name, "4 bases", seconds, np.nan)
