@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from llvmlite.binding import Linkage
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.registry import CPUDispatcher
@@ -23,7 +24,11 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
         linked = options | {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
         super().__init__(function, targetoptions=linked, pipeline_class=LinkedCompiler)
-        self.entry = Entry(function, targetoptions=options | {"no_cfunc_wrapper": True})
+        self.entry = Entry(
+            function,
+            targetoptions=options | {"no_cfunc_wrapper": True},
+            pipeline_class=EntryCompiler,
+        )
         for dispatcher in (self, self.entry):
             dispatcher.enable_caching()
             dispatcher.files = KernelFiles(dispatcher)
@@ -51,6 +56,31 @@ class Entry(CPUDispatcher):  # type: ignore[misc]
         for environment in cres._find_referenced_environments():
             cres.library.codegen.set_env(environment.env_name, environment)
         super().add_overload(cres)
+
+
+class EntryCompiler(Compiler):  # type: ignore[misc]
+    """Compiles to machine code that contains all kernels which it calls."""
+
+    def __init__(
+        self, typing: Any, target: Any, _library: Any, args: Any, *more: Any
+    ) -> None:
+        library = EntryLibrary(target.codegen(), "entry")
+        library.enable_object_caching()
+        super().__init__(typing, target, library, args, *more)
+
+
+class EntryLibrary(JITCodeLibrary):  # type: ignore[misc]
+    """Machine code of one entry.
+
+    The kernels in it are its own. Otherwise LLVM would call the copy of another entry that
+    was loaded before, which may be inlined and rounded in another way.
+    """
+
+    def _optimize_final_module(self) -> None:
+        for function in self._final_module.functions:
+            if not function.is_declaration and function.linkage == Linkage.linkonce_odr:
+                function.linkage = Linkage.internal
+        super()._optimize_final_module()
 
 
 class LinkedCompiler(Compiler):  # type: ignore[misc]

@@ -96,6 +96,26 @@ def test_kernel__without_its_stored_code_is_compiled_again(tmp_path):
     assert _printed(call, tmp_path) == "2.0 0"
 
 
+LONG = (
+    "from package.jit import kernel\nimport math\n\n@kernel\ndef inner(x):\n    return "
+    + " + ".join(f"math.sin({i} * x)" for i in range(200))
+)
+SHARED = """
+from package._outer_kernels import outer
+outer(1.0)
+[compiled] = outer.entry.overloads.values()
+functions = compiled.library._final_module.functions
+print({function.linkage.name for function in functions if "inner" in function.name})
+"""
+
+
+def test_kernel__calls_its_own_copies_of_kernels(tmp_path):
+    # too long to be inlined; LLVM would call the copy of the entry that was loaded first
+    outer = OUTER.replace("10 * inner(x)", "inner(x) + inner(2 * x)")
+    _package(tmp_path, _outer_kernels=outer, _inner_kernels=LONG)
+    assert _printed(SHARED, tmp_path) == "{'internal'}"
+
+
 DIGESTS = """
 import importlib
 from numba.core.registry import CPUDispatcher
