@@ -75,7 +75,9 @@ def test_judge__error_of_the_normal_as_refits_of_all_samples(samples):
     )
     positive = given.parameters > 0
     ratio = np.sqrt(part[positive] / expected[positive])
-    # a fifth of the samples is computed anew
-    assert abs(np.median(ratio) - 1) < 0.01
-    assert 0.85 < ratio.min() < ratio.max() < 1.15
+    # a fourth of the samples is computed anew, see `_turn_kernels`
+    low, median, high = np.quantile(ratio, [0.05, 0.5, 0.95])
+    assert abs(median - 1) < 0.01
+    assert 0.9 < low < high < 1.1
+    assert 0.8 < ratio.min() < ratio.max() < 1.25
     assert len(ratio) > 40
