@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import gc
-import multiprocessing
-import os
 import subprocess
 import sys
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor, as_completed
 
 import numpy as np
 
@@ -36,27 +33,25 @@ def compile_kernels(progress: Progress = silent) -> None:
     if all(is_stored(kernel) for kernel in kernels):
         return
     progress(COMPILING, 0, len(STEPS))
-    call = f"from {__name__} import compile_each; compile_each({thread_count()})"
+    with ThreadPoolExecutor(thread_count()) as pool:
+        calls = [pool.submit(_compile_apart, step) for step in STEPS]
+        try:
+            for done, call in enumerate(as_completed(calls), 1):
+                call.result()
+                progress(COMPILING, done, len(STEPS))
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _compile_apart(step: str) -> None:
+    # what the compiler makes are millions of objects that stay
+    call = f"import gc; gc.disable(); from {__name__} import compile_step; compile_step({step!r})"
     # what fails here fails in the fit too, which reports it
-    command = [sys.executable, "-c", call]
-    # without threads of BLAS, as a process with threads is not copied safely
-    alone = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    with subprocess.Popen(command, env=alone, stdout=subprocess.PIPE) as child:
-        for done, _ in enumerate(child.stdout or (), 1):
-            progress(COMPILING, done, len(STEPS))
+    subprocess.run([sys.executable, "-c", call], check=False, capture_output=True)
 
 
-def compile_each(processes: int) -> None:
-    """Compile every step in a copy of this process, and print it when it is done."""
-    gc.disable()  # the compiler makes millions of objects that stay
-    with ProcessPoolExecutor(processes, multiprocessing.get_context("fork")) as pool:
-        for call in as_completed([pool.submit(compile_step, step) for step in STEPS]):
-            sys.stdout.write(f"{call.result()}\n")
-            sys.stdout.flush()
-
-
-def compile_step(step: str) -> str:
-    """Compile the kernels of one of the STEPS, by a fit of no surfels; returns the step."""
+def compile_step(step: str) -> None:
+    """Compile the kernels of one of the STEPS, by a fit of no surfels."""
     none = np.zeros((0, 3))
     one = np.zeros((1, 3))
     sample = np.zeros((0, 1, 1, 3), np.float16)
@@ -76,4 +71,3 @@ def compile_step(step: str) -> str:
             model.judge(block, comparison, judgement)
         case "normals":
             surfel_normals(*block[:4], none, method=METHODS[0], eta=1.3, scan_error=3.0)
-    return step
