@@ -157,12 +157,17 @@ def private_umask() -> Iterator[None]:
 
 def cache_folder() -> Path | None:
     """Folder SKINDB_CACHE, or `skindb` in the user's cache folder; None if SKINDB_CACHE
-    is empty.
+    is empty, or if the user has no folder.
     """
     named = os.environ.get("SKINDB_CACHE")
     if named is not None:
         return Path(named) if named else None
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "skindb"
+    try:
+        return (
+            Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "skindb"
+        )
+    except RuntimeError:
+        return None
 
 
 def make_private(folder: Path, mode: int = PRIVATE) -> None:
@@ -244,9 +249,11 @@ def package_digest(root: Path = ROOT) -> str:
     same program.
     """
     digest = hashlib.sha256()
-    for file in sorted(
-        file for end in ("py", "pyi", "json") for file in root.rglob(f"*.{end}")
-    ):
+    files = [file for end in ("py", "pyi", "json") for file in root.rglob(f"*.{end}")]
+    for file in sorted(files):
+        # locks and copies of editors
+        if file.name.startswith(".") or not file.is_file():
+            continue
         name = file.relative_to(root).as_posix()
         digest.update(name.encode() + b"\0" + file.read_bytes() + b"\0")
     return digest.hexdigest()

@@ -6,13 +6,14 @@ from __future__ import annotations
 
 import shutil
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from skindb.files import package_digest
+from skindb.files import cache_folder, package_digest
 from skindb.fit.model import second_pass
 from skindb.schema import dataset
 from skindb.store import Database
@@ -179,6 +180,38 @@ def test_code_digest__covers_a_fit_are_science_with_its_kernels():
     assert {"skindb.numerics._nnls_kernels", "skindb.jit", "skindb.threads"} <= modules
     top = {name.split(".")[1] for name in modules}
     assert top.isdisjoint({"analysis", "render", "store", "workflow", "cli", "export"})
+
+
+def test_code_digest__of_code_that_was_edited_meanwhile_is_not_stored(package):
+    model = package / "science/model.py"
+    before = code_digest(FIT)
+    other = SimpleNamespace(__module__="skindb.science.model", __qualname__="plot")
+    plain = code_digest(other)
+    module._source.cache_clear()
+    module._digest_of.cache_clear()
+    model.write_text(FILES["science/model.py"].replace("return values", "return None"))
+    assert code_digest(other) != plain
+    model.write_text(FILES["science/model.py"])
+    for function in (module._source, module._digest_of, package_digest):
+        function.cache_clear()
+    assert (code_digest(other), code_digest(FIT)) == (plain, before)
+
+
+def test_package_digest__ignores_locks_of_editors(package):
+    before = package_digest(package)
+    (package / "science/.#model.py").symlink_to("nobody@nowhere.1")
+    package_digest.cache_clear()
+    assert package_digest(package) == before
+
+
+def test_cache_folder__without_a_home(monkeypatch):
+    def homeless():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("SKINDB_CACHE", raising=False)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", homeless)
+    assert cache_folder() is None
 
 
 def test_package_digest__changes_with_every_byte(package):
