@@ -136,7 +136,6 @@ def ingest_capture(
     report("surfels", 1, 1)
     run = _Run(capture, surfels, parameters, report)
     run.groups |= {"mesh": mesh_group(capture, surfels), "atlas": atlas_group(surfels)}
-    run.measure_probe()
     with ExitStack() as stack:
         if capture.dome is None:
             run.groups["surfels"] = surfel_group(surfels)
@@ -145,6 +144,8 @@ def ingest_capture(
             # ends before the spool does
             pool = stack.enter_context(ThreadPoolExecutor(threads(capture.dome)))
             _DomeStages(run, capture.dome, spool, pool).sample()
+        # last, as the frames of the dome are checked only if nothing else is at fault
+        run.measure_probe()
         run.require_no_faults()
         tree = xr.DataTree.from_dict(run.groups)
         tree.attrs = run.attributes()
@@ -280,6 +281,8 @@ class _DomeStages:
         for merger in mergers.values():
             self.run.faults += dark_faults(self.dome, merger)
         intensity, measured = self._intensity(mergers)
+        # otherwise samples are those of other intensities, dark frames and cameras
+        self.spool.resumable = not self.run.faults
         scene = RayScene(surfels.position, surfels.faces)
         light_fraction = light_visibility(
             surfels, self.dome.lights, scene, self.pool, method=method

@@ -75,6 +75,8 @@ class Spool:
         self.shape = shape
         self._frames = dict(frames)
         self._key = key.encode()
+        # whether later runs may use the views of this one
+        self.resumable = True
         self.done = np.zeros((lights, cameras), bool)
         # number of samples of each view
         self.views = np.zeros((lights, cameras), np.int64)
@@ -110,7 +112,7 @@ class Spool:
         trace: TracebackType | None,
     ) -> None:
         try:
-            if kind is None or not self.done.any():
+            if kind is None or not (self.resumable and self.done.any()):
                 _remove(self.folder)
             else:
                 # a full disk: the error that is being raised reports it
@@ -136,7 +138,7 @@ class Spool:
             self.done[light, camera] = True
             self.digests |= digests
             due = time.monotonic() - self._written > JOURNAL_INTERVAL_SECONDS
-        if due:
+        if due and self.resumable:
             self.checkpoint()
 
     def keep(self, name: str, array: NDArray[Any]) -> None:

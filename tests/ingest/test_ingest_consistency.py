@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -596,6 +598,60 @@ def test_ingest_capture__interrupted_with_rotated_cameras_has_the_same_samples(
     same = np.isclose(before, after, equal_nan=True).all(axis=(0, 3))
     assert seen.any()
     assert not (seen & same).any()
+
+
+@contextmanager
+def _damaged(file):
+    """A frame that cannot be decoded, although its size and date are those of before."""
+    content = file.read_bytes()
+    status = file.stat()
+
+    def write(part):
+        file.write_bytes(content[:60] + part + content[200:])
+        os.utime(file, ns=(status.st_atime_ns, status.st_mtime_ns))
+
+    write(bytes(140))
+    try:
+        yield
+    finally:
+        write(content[60:200])
+
+
+@pytest.mark.parametrize("part", ["contact", "dome/white"])
+def test_ingest_capture__repaired_is_refined_and_checked_like_any_other(
+    shoot, tmp_path, part
+):
+    """Frames of other things than the face were damaged, also after an interruption: the
+    run that resumes has the same samples and calibration as if nothing had happened.
+    """
+    capture = read_capture(shoot.folder)
+    parameters = IngestParameters(spacing_mm=8.0, refine=True)
+    stages = []
+
+    def interrupt(stage, step, _):
+        stages.append(stage)
+        if "refine" in stages and stage == "sample" and step >= 30:
+            raise KeyboardInterrupt
+
+    def ingested(name, progress=None):
+        with ingest_capture(
+            capture, parameters, scratch=tmp_path / name, progress=progress
+        ) as tree:
+            return tree.load()
+
+    with pytest.raises(KeyboardInterrupt):
+        ingested("interrupted", interrupt)
+    frame = sorted((shoot.folder / part).rglob("*.png"))[0]
+    with _damaged(frame):
+        for name in ("interrupted", "new"):
+            with pytest.raises(InputError, match=frame.name):
+                ingested(name)
+    whole = ingested("whole")
+    assert np.isfinite(whole["calibration/camera_agreement"]).all()
+    for name in ("interrupted", "new"):
+        repaired = ingested(name)
+        for group in ("samples", "calibration", "dome", "photographs", "probe"):
+            assert whole[group].to_dataset().identical(repaired[group].to_dataset())
 
 
 def test_camera_offset__finds_a_planted_move_of_a_smooth_picture():
