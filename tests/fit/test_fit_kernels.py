@@ -7,6 +7,9 @@ import sys
 
 import pytest
 
+from skindb.fit import kernels
+from skindb.fit.kernels import STEPS
+
 SIGNATURES = """
 import sys
 import skindb
@@ -35,3 +38,14 @@ def test_compile_step__compiles_what_fits_use(fitted_database):
         check=False,
     )
     assert done.stdout == "True\n", done.stderr
+
+
+def test_compile_kernels__ends_although_its_processes_are_killed(tmp_path, monkeypatch):
+    program = tmp_path / "python"
+    program.write_text("#!/bin/sh\nkill -9 $$\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    monkeypatch.setattr(kernels, "is_stored", lambda _: False)
+    steps = []
+    kernels.compile_kernels(lambda _, done, total: steps.append((done, total)))
+    assert steps == [(done, len(STEPS)) for done in range(len(STEPS) + 1)]
