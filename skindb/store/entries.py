@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 from skindb.schema.consent import CONSENT
 from skindb.store.place import Place, in_parallel
@@ -68,6 +68,7 @@ CACHED_FIELDS = (
     "admissions",
     "seal",
 )
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,30 +114,39 @@ def block_keys(place: Place, folder: str) -> list[str]:
     return [f"{folder}/{name}" for name in names]
 
 
-def read_blocks(place: Place) -> dict[str, list[Entry] | None]:
-    """Key of every block -> its entries; None if it is damaged."""
-    blocks: dict[str, list[Entry] | None] = {}
+def read_cache(
+    place: Place, folder: str, read: Callable[[str], T | None]
+) -> dict[str, T | None]:
+    """Key of every file of a cache -> what is read from it; None if it is damaged or
+    foreign. Files that are written or removed meanwhile are not included.
+    """
+    blocks: dict[str, T | None] = {}
+    keys = block_keys(place, folder)
     for _ in range(MAX_LISTINGS):
-        listed = block_keys(place, CATALOGUE)
-        keys = [
-            key for key in listed if re.fullmatch(f"{CATALOGUE}/{CATALOGUE_BLOCK}", key)
-        ]
-        entries = in_parallel(partial(_read_block, place), keys)
-        blocks = dict(zip(keys, entries, strict=True))
-        if None not in blocks.values():
+        blocks = dict(zip(keys, in_parallel(read, keys), strict=True))
+        damaged = {key for key, block in blocks.items() if block is None}
+        keys = block_keys(place, folder) if damaged else keys
+        if damaged <= {*keys}:
             break
-    return blocks
+    return {key: b for key, b in blocks.items() if b is not None or key in keys}
+
+
+def read_blocks(place: Place) -> dict[str, list[Entry] | None]:
+    """Key of every block of the catalogue -> its entries; None if it is damaged."""
+    blocks = read_cache(place, CATALOGUE, partial(_read_block, place))
+    pattern = f"{CATALOGUE}/{CATALOGUE_BLOCK}"
+    return {key: block for key, block in blocks.items() if re.fullmatch(pattern, key)}
 
 
 def catalogue_blocks_of(place: Place, is_named: Callable[[str], bool]) -> list[str]:
     """Blocks, and foreign files beside them, that may name a subject for whom `is_named`
     is true.
     """
-    blocks = read_blocks(place)
+    blocks = read_cache(place, CATALOGUE, partial(_read_block, place))
     return [
         key
-        for key in block_keys(place, CATALOGUE)
-        if (entries := blocks.get(key)) is None
+        for key, entries in blocks.items()
+        if entries is None
         or any(is_named(name) for entry in entries for name in entry.record.subjects)
     ]
 

@@ -24,7 +24,7 @@ from skindb.errors import InputError, input_error, require
 from skindb.schema.cohort import TAKE, Held, Values, combine, values_of
 from skindb.schema.variables import VARIABLES
 from skindb.store.bucket import place_at
-from skindb.store.entries import block_keys
+from skindb.store.entries import block_keys, read_cache
 from skindb.store.log import RESTORE, committed_logs
 from skindb.store.markers import read_markers
 from skindb.store.place import Place, subject_of
@@ -131,8 +131,9 @@ def _blocks_with(
     place: Place, label: str, is_chosen: Callable[[str], bool]
 ) -> list[str]:
     """Blocks with such a label of a take, and those that cannot be read."""
-    keys = block_keys(place, GATHERED)
-    blocks = {key: intact_or_none(partial(_stored, place, key)) for key in keys}
+    blocks = read_cache(
+        place, GATHERED, lambda key: intact_or_none(partial(_stored, place, key))
+    )
     return [
         key
         for key, block in blocks.items()

@@ -10,6 +10,7 @@ import pytest
 from stored import commit
 
 import skindb
+from skindb.errors import InputError
 from skindb.store import entries
 from skindb.store.erasure import erase
 from skindb.store.log import Log
@@ -92,6 +93,33 @@ def test_read_blocks__that_another_query_merges_meanwhile(db):
     with mock.patch.object(entries, "block_keys", side_effect=listings):
         [rows] = entries.read_blocks(db.place).values()
     assert [row.record.take for row in rows] == ["A1", "B2", "C3", "D4"]
+
+
+def test_verify__while_a_query_writes_a_block(db):
+    erase(db.place, "B2")
+    for number in range(8):
+        commit(db.root, take=f"E{number}", **SCOPE)
+    db.table()
+    new_takes = ["F1"]
+
+    def listed(place, folder):
+        keys = block_keys(place, folder)
+        if folder == "catalogue" and new_takes:
+            commit(db.root, take=new_takes.pop(), **SCOPE)
+            db.table()
+        return keys
+
+    block_keys = entries.block_keys
+    with mock.patch.object(entries, "block_keys", listed):
+        assert db.verify() == []
+    assert len(_blocks(db)) == 2
+
+
+def test_erase__an_unknown_subject_beside_a_block_that_cannot_be_read(db):
+    (db.root / "catalogue").mkdir()
+    (db.root / "catalogue/notes.txt").write_text("Z9")
+    with pytest.raises(InputError, match="Z9: the database must hold the subject"):
+        erase(db.place, "Z9")
 
 
 @pytest.mark.parametrize("is_enabled", [True, False])

@@ -125,6 +125,23 @@ def test_erase__removes_every_block_with_the_subject(db):
     assert db.verify() == []
 
 
+def test_verify__while_a_block_is_removed(db):
+    erase(db.place, "S5")
+    _values(db)
+    first = _blocks(db)[0]
+    children = type(db.place).children
+
+    def listed(place, key, **options):
+        names = children(place, key, **options)
+        if key == "gathered" and not options:
+            first.unlink(missing_ok=True)
+        return names
+
+    with mock.patch.object(type(db.place), "children", listed):
+        assert db.verify() == []
+    assert not first.exists()
+
+
 def test_erase__a_block_that_is_being_made_is_not_written(db):
     packed = gathered._packed
 
