@@ -442,8 +442,8 @@ def _thinned(frame: Frame) -> Frame:
 
 
 class SensorPatterns:
-    """Mean photograph of each camera that has dark frames, whose fixed pattern shows
-    whether they are those of this camera, turned as it is.
+    """Mean photograph of each camera that has dark frames without `dark_faults`, whose
+    fixed pattern shows whether they are those of this camera, turned as it is.
 
     The pattern differs from pixel to pixel, so that even a small part of it is enough.
     Compared is the shortest exposure, in which the least light hides the pattern.
@@ -459,6 +459,7 @@ class SensorPatterns:
             for c, camera in enumerate(dome.cameras)
             for j in range(0, len(dome.lights), step)
             if mergers[camera.id].dark is not None
+            and not dark_faults(dome, mergers[camera.id])
         )
         self._added = set[tuple[int, int]]()
         self._total = dict[str, Float32]()
@@ -490,7 +491,7 @@ class SensorPatterns:
         for j, c in sorted(self.pairs.intersection(views) - self._added):
             camera = self._dome.cameras[c]
             self.add(j, c, read_view(self._dome, self._dome.lights[j].id, camera))
-        faults = pool.map(self._fault, self._total)
+        faults = pool.map(self._fault, sorted(self._total))
         return [fault for fault in faults if fault is not None]
 
     def _fault(self, camera: str) -> Fault | None:

@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.calibration._merge_kernels import OK, SATURATED
-from skindb.calibration.frame_checks import SensorPatterns, checked_view, highest_value
+from skindb.calibration.frame_checks import SensorPatterns, highest_value, view_faults
 from skindb.calibration.irradiance import light_falloff
 from skindb.calibration.radiance import (
     FrameMerger,
     Image,
     radiance_floor,
     radiance_noise,
+    read_view,
     vignette_gain,
 )
 from skindb.errors import Fault, InputError, attempt, require
@@ -211,8 +212,7 @@ class Sampler:
         Parameters
         ----------
         check
-            Whether the calibration and the dark frames are checked, by views that come
-            first.
+            Whether the calibration is checked.
         refuse
             Whether a calibration that the photographs contradict is an error.
 
@@ -224,12 +224,12 @@ class Sampler:
         """
         calibration = None
         contradictions = list[Fault]()
-        if check:
-            pictures = self.pictures(self.check.pairs)
-            self._sample(self._patterns.pairs)
-            done = zip(*np.nonzero(self.spool.done), strict=True)
-            self.faults += self._patterns.faults(done, self.pool)
-            calibration = None if self.faults else self.check.evaluate(pictures)
+        pictures = self.pictures(self.check.pairs if check else ())
+        self._sample(self._patterns.pairs)
+        done = zip(*np.nonzero(self.spool.done), strict=True)
+        self.faults += self._patterns.faults(done, self.pool)
+        if check and not self.faults:
+            calibration = self.check.evaluate(pictures)
         if calibration is not None and refuse:
             contradictions = calibration_faults(self.check.dome, calibration)
         # otherwise hours of sampling would end with the same faults
@@ -278,8 +278,11 @@ class Sampler:
         merger = self.mergers[dome.cameras[c].id]
         shot = self._shots[c]
         digests: Digests = {}
-        frames = checked_view(dome, light.id, merger, digests=digests)
+        frames = read_view(dome, light.id, merger.camera, digests=digests)
+        # wrong dark frames may be why the view is faulty
         self._patterns.add(j, c, frames)
+        if faults := view_faults(dome, light.id, merger, frames):
+            raise InputError(faults)
         surfels = shot.surfels & self.lit[:, j]
         whole = picture or (j, c) in self.kept
         height, width, _ = frames[0].shape

@@ -548,6 +548,8 @@ def pattern(rng, kind):
     """Offsets (h, w, 3) of the pixels of one sensor."""
     if kind == "columns":
         return np.broadcast_to(rng.normal(0, 12, (1, WIDTH, 1)), (HEIGHT, WIDTH, 3))
+    if kind == "strong":
+        return rng.uniform(0, 2_000, (HEIGHT, WIDTH, 3))
     offset = (
         rng.normal(0, 12, (HEIGHT, WIDTH, 1))
         if kind == "grey"
@@ -623,6 +625,13 @@ def test_sensor_patterns__dark_frames_of_another_camera(capture_folder):
     ]
 
 
+def test_sensor_patterns__dark_frames_with_other_faults_are_not_compared(
+    capture_folder,
+):
+    write_dark(capture_folder, change=lambda frame: frame[::-1, ::-1] + np.uint16(9000))
+    assert found(capture_folder) == []
+
+
 @pytest.mark.parametrize("kind", ["pixels", "grey", "columns", "hot pixels"])
 def test_sensor_patterns__true_dark_frames_have_none(capture_folder, kind):
     write_dark(capture_folder, kind=kind)
@@ -644,16 +653,24 @@ def test_sensor_patterns__one_frame_for_all_cameras_and_unrelated_ones_have_none
     assert found(capture_folder) == []
 
 
-def test_ingest_capture__dark_frames_upside_down_are_refused(capture_folder, tmp_path):
-
-    write_dark(capture_folder, change=lambda frame: frame[::-1, ::-1])
-    with pytest.raises(
-        InputError,
-        match=r"dome\.json\[dark\]: dark frames must .*; found camera c0: they look upside",
-    ):
-        ingest_take(
-            Database(tmp_path / "db"), capture_folder, spacing_mm=8.0, photographs=0
-        )
+@pytest.mark.parametrize(
+    ("kind", "contradicted"),
+    [("pixels", []), ("strong", ["[white][frames]", "[frames]"])],
+)
+def test_ingest_capture__dark_frames_upside_down_are_refused(
+    capture_folder, tmp_path, kind, contradicted
+):
+    """Also where all photographs, and those of the white target, are darker than them."""
+    write_dark(capture_folder, kind=kind, change=lambda frame: frame[::-1, ::-1])
+    with pytest.raises(InputError) as caught:
+        ingested(capture_folder, tmp_path / "db")
+    *others, first, second = caught.value.faults
+    for fault, camera in ((first, "c0"), (second, "c1")):
+        assert fault.where.endswith("dome.json[dark]")
+        assert fault.rule == RULE
+        assert fault.found == f"camera {camera}: they look upside down"
+    assert [other.where.rpartition("dome.json")[2] for other in others] == contradicted
+    assert all("darker than the dark frame" in other.rule for other in others)
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])

@@ -547,9 +547,9 @@ def test_ingest_capture__judges_and_samples_views_by_decoding_them_once(
     shoot, tmp_path, monkeypatch
 ):
     decoded = []
-    plain = lumitexels.checked_view
+    plain = lumitexels.read_view
     monkeypatch.setattr(
-        lumitexels, "checked_view", lambda *a, **k: decoded.append(a) or plain(*a, **k)
+        lumitexels, "read_view", lambda *a, **k: decoded.append(a) or plain(*a, **k)
     )
     capture = read_capture(shoot.folder)
     parameters = IngestParameters(spacing_mm=8.0)

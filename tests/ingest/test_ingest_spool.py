@@ -403,9 +403,9 @@ def test_ingest_capture__killed_goes_on_where_it_was(
     assert db.takes() == []
     assert db.verify() == []
 
-    plain = lumitexels.checked_view
+    plain = lumitexels.read_view
     monkeypatch.setattr(
-        lumitexels, "checked_view", lambda *a, **k: read.append(a) or plain(*a, **k)
+        lumitexels, "read_view", lambda *a, **k: read.append(a) or plain(*a, **k)
     )
     record = ingest_take(db, pristine, spacing_mm=8.0)
     assert len(read) <= (
@@ -458,9 +458,9 @@ def test_ingest_capture__survives_a_kill_without_goodbye(
     db = Database(folder)
     read = []
     assert db.takes() == []
-    plain = lumitexels.checked_view
+    plain = lumitexels.read_view
     monkeypatch.setattr(
-        lumitexels, "checked_view", lambda *a, **k: read.append(a) or plain(*a, **k)
+        lumitexels, "read_view", lambda *a, **k: read.append(a) or plain(*a, **k)
     )
     ingest_take(db, pristine, spacing_mm=8.0)
     assert len(read) <= (3 if point == "sample" else 0)
