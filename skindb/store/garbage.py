@@ -13,7 +13,7 @@ from skindb.errors import InputError, input_error
 from skindb.limits import RESUMABLE_SECONDS
 from skindb.schema.consent import CONSENT
 from skindb.store.erasure import SCRATCH_NAME, erase_withdrawn, holdings_of
-from skindb.store.gathered import GATHERED, outdated_blocks
+from skindb.store.gathered import GATHERED, unneeded_blocks
 from skindb.store.lease import NUMBER, Lease, abandoned_holder, holder_of, storage_time
 from skindb.store.log import Log, committed_logs, takes_below
 from skindb.store.markers import Markers, read_markers
@@ -31,6 +31,7 @@ from skindb.store.stage import remove_version
 from skindb.store.verify import may_have_had_record, partly_removed_records, tombstones
 
 STILL_WRITING_SECONDS = 3600.0  # newer files may belong to a run without a lease
+KEPT_BLOCK_SECONDS = 24 * 3600.0
 KEPT_KINDS = (CONSENT, RELEASE, CALIBRATION)  # kinds of which all generations are kept
 # equal in a first pass and its model
 FIT_IDENTITY = ("inputs", "requested", "dictionary_digest", "code_digest")
@@ -73,7 +74,7 @@ def find_garbage(place: Place, generations: int | None = None) -> list[Garbage]:
         *_of_withdrawn_subjects(place, markers),
         *_temporary_files(place, now),
         *_scratch_folders(place, now),
-        *_outdated_blocks(place),
+        *_unneeded_blocks(place, now),
     ]
     unrecorded = partial(_unrecorded, tombstone_names=tombstones(place))
     for key, of_take in (("data", unrecorded), ("leases", _abandoned_leases)):
@@ -281,13 +282,17 @@ def _temporary_files(place: Place, now: Clock) -> Iterator[Garbage]:
             yield Garbage(key, "a temporary file of a killed writer", size, reason)
 
 
-def _outdated_blocks(place: Place) -> Iterator[Garbage]:
-    """Gathered tables of versions that were replaced."""
-    outdated = outdated_blocks(place)
-    sizes = place.sizes(GATHERED) if outdated else {}
-    for key in outdated:
+def _unneeded_blocks(place: Place, now: Clock) -> Iterator[Garbage]:
+    """Gathered tables of versions that were replaced, or that other blocks hold too."""
+    unneeded = unneeded_blocks(place)
+    sizes = place.sizes(GATHERED) if unneeded else {}
+    for key in unneeded:
         size = sizes.get(key.removeprefix(f"{GATHERED}/"), 0)
-        yield Garbage(key, "tables that studies gathered from earlier versions", size)
+        # for example of a release, which the next study of it would gather again
+        reason = _recent_reason(place, [key], now, KEPT_BLOCK_SECONDS)
+        yield Garbage(
+            key, "tables that studies gathered and later ones do not need", size, reason
+        )
 
 
 def _scratch_folders(place: Place, now: Clock) -> Iterator[Garbage]:

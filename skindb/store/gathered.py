@@ -34,12 +34,14 @@ from skindb.store.stage import describe, read_tables
 
 GATHERED = "gathered"
 BLOCK_NAME = r"[0-9a-f]{64}\.npz"
-GATHERED_TAKES = 256  # in a block
+BLOCK_KEY = rf"{GATHERED}/{BLOCK_NAME}"
+GATHERED_TAKES = 256  # in a block, on average
 SEAL = "seal"  # of the version of each take in a block
 DIGEST_BYTES = 32  # before the content of a block
 # cached by a process; the tables of a take have some 20 kB, blocks 3 kB for each take
 MAX_OPEN_TABLES = 2048
 MAX_OPEN_BLOCKS = 64
+MAX_LISTED_BLOCKS = 1024  # whose seals a process remembers
 
 
 @dataclass(frozen=True)
@@ -101,44 +103,62 @@ class StoredTables:
 
 
 def table_sources(addresses: Iterable[Address]) -> list[StoredTables]:
-    """Sources of the tables of takes, which share blocks."""
-    listed = tuple(addresses)
+    """Sources of the tables of takes, which share blocks.
+
+    A block starts where the digest of a take says so, not after a number of takes, so
+    that a take that is added or missing changes only its own block.
+    """
+    parts: list[list[Address]] = []
+    for one in addresses:
+        number = int.from_bytes(hashlib.sha256(one.take.encode()).digest(), "big")
+        if not parts or number % GATHERED_TAKES == 0:
+            parts.append([])
+        parts[-1].append(one)
     sources = []
-    for start in range(0, len(listed), GATHERED_TAKES):
-        part = listed[start : start + GATHERED_TAKES]
+    for part in parts:
         seals = "\n".join(one.seal for one in part)
         digest = hashlib.sha256(seals.encode()).hexdigest()
-        block = Block(f"{GATHERED}/{digest}.npz", part)
+        block = Block(f"{GATHERED}/{digest}.npz", tuple(part))
         sources += [StoredTables(one, block, i) for i, one in enumerate(part)]
     return sources
 
 
 def blocks_of(place: Place, is_named: Callable[[str], bool]) -> list[str]:
     """Blocks that may hold the tables of a subject for whom `is_named` is true."""
-    return _blocks_with(place, TAKE, lambda take: is_named(subject_of(take)))
-
-
-def outdated_blocks(place: Place) -> list[str]:
-    """Blocks with tables of a version that is not the newest of its kind and take."""
-    if not block_keys(place, GATHERED):
-        return []
-    newest = {log.head().get(SEAL) for log in committed_logs(place)}
-    blocks = _blocks_with(place, SEAL, lambda seal: seal not in newest)
-    return [key for key in blocks if re.fullmatch(rf"{GATHERED}/{BLOCK_NAME}", key)]
-
-
-def _blocks_with(
-    place: Place, label: str, is_chosen: Callable[[str], bool]
-) -> list[str]:
-    """Blocks with such a label of a take, and those that cannot be read."""
-    blocks = read_cache(
-        place, GATHERED, lambda key: intact_or_none(partial(_stored, place, key))
-    )
     return [
         key
-        for key, block in blocks.items()
-        if block is None or any(map(is_chosen, block[label].values.tolist()))
+        for key, takes in _labels(place, TAKE).items()
+        if takes is None or any(is_named(subject_of(take)) for take in takes)
     ]
+
+
+def unneeded_blocks(place: Place) -> list[str]:
+    """Blocks that are damaged, hold a version that is not the newest of its kind and
+    take, or hold only versions that larger blocks hold too.
+    """
+    blocks = _labels(place, SEAL)
+    if not blocks:
+        return []
+    newest = {log.head().get(SEAL) for log in committed_logs(place)}
+    unneeded = []
+    held: set[str] = set()
+    for key in sorted(blocks, key=lambda key: -len(blocks[key] or ())):
+        seals = blocks[key]
+        if not seals or not seals <= newest or seals <= held:
+            unneeded.append(key)
+        else:
+            held |= seals
+    return [key for key in unneeded if re.fullmatch(BLOCK_KEY, key)]
+
+
+def _labels(place: Place, label: str) -> dict[str, set[str] | None]:
+    """Key of each block -> a label of its takes; None if it cannot be read."""
+
+    def read(key: str) -> set[str] | None:
+        stored = intact_or_none(partial(_stored, place, key))
+        return None if stored is None else {*stored[label].values.tolist()}
+
+    return read_cache(place, GATHERED, read)
 
 
 @lru_cache(MAX_OPEN_BLOCKS)
@@ -157,7 +177,25 @@ def _opened(block: Block) -> xr.Dataset:
     with suppress(OSError, InputError):
         guard = partial(require_same_markers, place, markers, block.key)
         place.replace(block.key, _packed(block.key, gathered), guard=guard)
+        _remove_parts(block)
     return gathered
+
+
+def _remove_parts(block: Block) -> None:
+    """Remove the blocks all of whose versions this one holds too."""
+    place = block.addresses[0].place
+    seals = {one.seal for one in block.addresses}
+    for key in block_keys(place, GATHERED):
+        if key != block.key and re.fullmatch(BLOCK_KEY, key):
+            held = intact_or_none(partial(_seals, block.addresses[0].url, key))
+            if held is not None and held <= seals:
+                place.remove(key)
+
+
+# names of blocks follow from their seals
+@lru_cache(MAX_LISTED_BLOCKS)
+def _seals(url: str, key: str) -> frozenset[str]:
+    return frozenset(_stored(_place(url), key)[SEAL].values.tolist())
 
 
 def _packed(key: str, block: xr.Dataset) -> bytes:

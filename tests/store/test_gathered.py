@@ -4,6 +4,7 @@ holds nothing of withdrawn subjects.
 
 from __future__ import annotations
 
+import os
 from unittest import mock
 
 import numpy as np
@@ -15,7 +16,7 @@ from skindb.schema import dataset
 from skindb.store import Database, cohort, gathered
 from skindb.store.erasure import erase
 
-REGIONS = {"S1": "ab", "S2": "b", "S3": "abc", "S4": "c", "S5": "ab"}
+REGIONS = {"B1": "ab", "B2": "b", "B3": "abc", "B4": "c", "B5": "ab"}
 
 
 def _commit(db, subject, value):
@@ -73,11 +74,11 @@ def test_blocks__hold_what_the_versions_hold(db):
 def test_blocks__a_refit_makes_only_its_own_block_again(db):
     _values(db)
     first = {*_blocks(db)}
-    _commit(db, "S3", 9.0)
+    _commit(db, "B3", 9.0)
     with mock.patch.object(gathered, "_read", side_effect=gathered._read) as tables:
         values = _values(db)
-    assert sorted(call.args[0].take for call in tables.call_args_list) == ["S3", "S4"]
-    assert float(values["region_area"].sel(take="S3", region="a")) == 9.0
+    assert sorted(call.args[0].take for call in tables.call_args_list) == ["B3", "B4"]
+    assert float(values["region_area"].sel(take="B3", region="a")) == 9.0
     assert len({*_blocks(db)} - first) == 1
 
 
@@ -107,16 +108,16 @@ def test_blocks__in_doubt_are_made_from_the_versions(db, damage):
 def test_erase__removes_every_block_with_the_subject(db):
     _values(db)
     blocks = {file: file.read_bytes() for file in _blocks(db)}
-    damaged, *_ = [file for file, content in blocks.items() if b"S5" not in content]
+    damaged, *_ = [file for file, content in blocks.items() if b"B5" not in content]
     holding = [
-        file for file, content in blocks.items() if "S5".encode("utf-32-le") in content
+        file for file, content in blocks.items() if "B5".encode("utf-32-le") in content
     ]
     assert len(holding) == 1
     damaged = next(file for file in blocks if file not in holding)
     damaged.write_bytes(b"unknown")
-    erase(db.place, "S5")
+    erase(db.place, "B5")
     assert {*blocks} - {*_blocks(db)} == {*holding, damaged}
-    assert "S5" not in _values(db)["take"].values
+    assert "B5" not in _values(db)["take"].values
     # a block that comes back is found and removed
     holding[0].write_bytes(blocks[holding[0]])
     assert [holding[0].name in str(fault) for fault in db.verify()] == [True]
@@ -126,7 +127,7 @@ def test_erase__removes_every_block_with_the_subject(db):
 
 
 def test_verify__while_a_block_is_removed(db):
-    erase(db.place, "S5")
+    erase(db.place, "B5")
     _values(db)
     first = _blocks(db)[0]
     children = type(db.place).children
@@ -146,14 +147,14 @@ def test_erase__a_block_that_is_being_made_is_not_written(db):
     packed = gathered._packed
 
     def withdrawn_meanwhile(key, block):
-        if "S2" in block["take"].values:
-            erase(db.place, "S2")
+        if "B2" in block["take"].values:
+            erase(db.place, "B2")
         return packed(key, block)
 
     with mock.patch.object(gathered, "_packed", withdrawn_meanwhile):
         _values(db)
     for file in _blocks(db):
-        assert "S2".encode("utf-32-le") not in file.read_bytes()
+        assert "B2".encode("utf-32-le") not in file.read_bytes()
     assert db.verify() == []
 
 
@@ -162,26 +163,53 @@ def test_erase__tables_in_memory_make_no_block(db):
     gathered._opened.cache_clear()
     before = db.cohort("tables")
     _without_blocks(db)  # is now in memory
-    erase(db.place, "S2")
-    with pytest.raises(InputError, match="model of S2"):
+    erase(db.place, "B2")
+    with pytest.raises(InputError, match="model of B2"):
         before.compute(scheduler="synchronous")
     for file in _blocks(db):
-        assert "S2".encode("utf-32-le") not in file.read_bytes()
+        assert "B2".encode("utf-32-le") not in file.read_bytes()
     assert db.verify() == []
+
+
+def _age(file):
+    os.utime(file, (0, 0))
 
 
 def test_clean__removes_the_blocks_of_earlier_versions(db):
     _values(db)
-    first = _blocks(db)
-    _commit(db, "S3", 9.0)
+    [old] = [file for file in _blocks(db) if b"B\0\0\0003" in file.read_bytes()]
+    _commit(db, "B3", 9.0)
     _values(db)
-    [old] = [
-        f"gathered/{file.name}" for file in first if b"S\0\0\0003" in file.read_bytes()
-    ]
-    assert [item.key for item in db.garbage()] == [old]
-    db.clean()
+    # the next study of a release would gather it again
+    assert [bool(item.kept) for item in db.garbage()] == [True]
+    _age(old)
+    assert [item.key for item in db.clean()] == [f"gathered/{old.name}"]
     assert len(_blocks(db)) == 3
-    assert db.root / old not in _blocks(db)
+
+
+def test_clean__removes_old_blocks_whose_versions_others_hold(db):
+    _values(db)
+    needed = _blocks(db)
+    gathered._opened.cache_clear()
+    with mock.patch.object(cohort, "FEW_TAKES", 0):
+        db.cohort("tables", takes=["B4"]).compute(scheduler="synchronous")
+    for file in _blocks(db):
+        _age(file)
+    assert len(_blocks(db)) == len(needed) + 1
+    db.clean()
+    assert _blocks(db) == needed
+
+
+def test_blocks__of_added_takes_replace_those_before(db, monkeypatch):
+    """A take that is added changes one block, and the query removes the block before."""
+    monkeypatch.setitem(REGIONS, "B30", "a")  # between B3 and B4, in their block
+    _values(db)
+    first = {*_blocks(db)}
+    _commit(db, "B30", 9.0)
+    _values(db)
+    assert len({*_blocks(db)} - first) == 1
+    assert len(_blocks(db)) == 3
+    assert db.garbage() == []
 
 
 @pytest.mark.slow
@@ -192,7 +220,7 @@ def test_blocks__in_a_bucket(new_database, monkeypatch):
     for _ in range(2):
         xr.testing.assert_identical(_values(db), want)
         assert len(db.place.children("gathered")) == 3
-    erase(db.place, "S5")
+    erase(db.place, "B5")
     assert len(db.place.children("gathered")) == 2
     xr.testing.assert_identical(_values(db)["region_area"], want["region_area"][:-1])
     assert db.verify() == []
