@@ -84,7 +84,7 @@ class EntryLibrary(JITCodeLibrary):  # type: ignore[misc]
 
 
 class LinkedCompiler(Compiler):  # type: ignore[misc]
-    """Compiles to optimised code of LLVM instead of machine code."""
+    """Compiles to code of LLVM instead of machine code."""
 
     def __init__(
         self, typing: Any, target: Any, _library: Any, args: Any, *more: Any

@@ -270,9 +270,8 @@ def _linear_fault(place: str, frame: Frame) -> Fault | None:
     lights behind the face.
     """
     values = frame
-    if (
-        frame.dtype == np.float16
-    ):  # which is within the limit; some pixels show the rest
+    # half floats cannot exceed the limit, and some pixels show the rest
+    if frame.dtype == np.float16:
         values = _thinned(frame).astype(np.float32)
     finite = values[np.isfinite(values)]
     low = finite.min(initial=np.inf)

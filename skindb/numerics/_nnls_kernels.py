@@ -58,9 +58,8 @@ def factor(G: Matrix, active: IntVector, begin: int, k: int, L: Matrix) -> int:
             t = L[a, q] * L[q, q]
             L[a, q] = t
             pivot -= t * t
-            for c in range(
-                q + 1, a
-            ):  # independent, unlike the terms of a scalar product
+            # independent, unlike the terms of a scalar product
+            for c in range(q + 1, a):
                 L[a, c] -= t * L[c, q]
         if pivot <= MIN_PIVOT:
             return a

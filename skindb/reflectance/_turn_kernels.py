@@ -157,11 +157,15 @@ def add_turned(
     normal about either axis, directly after `weight_covariance`.
 
     Each of four turned normals changes the normal equations by the difference that it
-    makes to the chosen rows. Half vectors near the normal matter most; the difference of
-    the others is small and smooth, so that few stand for all.
+    makes to the chosen rows. In linear space, half vectors near the normal matter most; the
+    difference of the others is small and smooth, so that few stand for all.
     """
     chosen = _choose_rows(normal, problem.size, problem.perceptual, b, t)
-    _keep_others(problem.size, b, work, t)
+    if chosen < problem.size:
+        _keep_others(problem.size, b, work, t)
+    else:
+        t.gram[:] = 0.0
+        t.right[:] = 0.0
     part = Problem(
         t.rows,
         t.target,
