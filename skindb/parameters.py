@@ -197,9 +197,6 @@ class FitParameters(Limited):
         Model of the probe's profiles, see `fit_probe`.
     surface
         Surface model: a mixture of the BRDFs of a dictionary, or one GGX lobe.
-    stages
-        "joint": normals and R_d are refined together with the surface, see
-        `skindb.fit.joint`; "sequential": they are estimated before it, as in the paper.
     mode, rank
         Mode and rank of the fit by the dictionary, see `fit_surface`. After "paper" the
         refit uses "perceptual".
@@ -234,11 +231,6 @@ class FitParameters(Limited):
     )
     surface: Literal["mixture", "ggx"] = option(
         "mixture", "Surface model: mixture of measured BRDFs, or one GGX lobe."
-    )
-    stages: Literal["joint", "sequential"] = option(
-        "joint",
-        "Whether normals and R_d are refined together with the surface, or only "
-        "estimated one after the other.",
     )
     mode: FullMode = option(
         "perceptual",

@@ -36,8 +36,8 @@ MAX_DEVIATIONS = 1.0
 # Error of R_d relative to it, by lobes of other shapes: R_d was 1.7 to 2.6 % too low in
 # proportion in four captures without other errors.
 PROPORTIONAL_ERROR = 0.02
-# Fraction of what the highlights lack that R_d contains if it was estimated together with
-# nearly even lobes, which take the rest: 0.4 to 0.9 in blue in four captures. On 24 others
+# Fraction of what the highlights lack that R_d contains: the nearly even lobes of the joint
+# fit take the rest. 0.4 to 0.9 in blue in four captures. On 24 others
 # the mean bias of R_d in blue is 0 with it, and 3 % without (docs/validation.md).
 JOINT_FRACTION = 0.5
 SMALLEST_ERROR = 1e-9  # of a prior that is stated to be exact
@@ -97,8 +97,6 @@ def without_even_reflection(
     fitted: xr.Dataset,
     prior: Energy | None,
     leak: float | None = None,
-    *,
-    jointly: bool = False,
 ) -> tuple[xr.Dataset, dict[str, Any]]:
     """Subtract from R_d what the surface reflects evenly and without colour.
 
@@ -111,20 +109,15 @@ def without_even_reflection(
     leak
         From `crossed_gloss`; if it is given, R_d contains only this fraction of the even
         reflection, and nothing is subtracted.
-    jointly
-        Whether R_d was estimated together with lobes that are nearly even: half of the
-        mean rest is subtracted, given that the total exceeds what was seen. The lobes
-        took the other half from R_d.
 
     Returns
     -------
     fitted
-        With `even_reflection`, the mean of the prior minus the mean
-        `surface_reflectance` of the fitted surfels, but at most what the darkest
+        With `even_reflection`, half of what the mean `surface_reflectance` of the fitted
+        surfels lacks of the total, given that the total exceeds it (the nearly even
+        lobes of the joint fit took the other half from R_d), but at most what the darkest
         surfels reflect in blue, and with the standard deviation of the prior as its
-        error. After fits in sequence it is negative if the fitted lobes reflect too much,
-        which R_d then lacks. It is subtracted from R_d, and `dipole_s` follows. Without
-        a prior, or if
+        error. It is subtracted from R_d, and `dipole_s` follows. Without a prior, or if
         the highlights contradict it, nothing is subtracted. Its error and 0.02 R_d are
         added to the total error of R_d, in quadrature.
     summary
@@ -148,10 +141,7 @@ def without_even_reflection(
         summary |= prior._asdict() | {"contradicted": contradicted}
         if not contradicted:
             largest = float(np.quantile(diffuse[good, 2], DARKEST))
-            rest = prior.mean - seen
-            if jointly:
-                rest = JOINT_FRACTION * _expected_rest(prior, seen)
-            even = min(rest, largest)
+            even = min(JOINT_FRACTION * _expected_rest(prior, seen), largest)
             error = prior.error
     lower = np.clip(diffuse - even, SMALLEST_R_D, LARGEST_R_D)
     parts = (

@@ -188,10 +188,7 @@ def _fit_surfels(
     estimates = estimate_normals(samples, eta=eta)
     diffuse = estimate_diffuse_reflectance(samples.merge(estimates), eta=eta)
     estimates = estimates.merge(diffuse)
-    if parameters.stages == "joint":
-        estimates = refine_jointly(samples.merge(estimates), eta=eta).merge(
-            estimates, compat="override"
-        )
+    estimates = estimates.assign(refine_jointly(samples.merge(estimates), eta=eta))
     terms = fit_surface(
         samples.merge(estimates), surface=surface, mode=parameters.mode, eta=eta
     )
@@ -253,10 +250,7 @@ def second_pass(
     groups = _groups(capture, fitted.assign(judged), basis, gains)
     prior = energy_prior(str(capture.attrs.get("condition", "normal")), parameters)
     groups["fitted"], energy = without_even_reflection(
-        groups["fitted"],
-        prior,
-        crossed_gloss(samples, parameters.eta),
-        jointly=parameters.stages == "joint",
+        groups["fitted"], prior, crossed_gloss(samples, parameters.eta)
     )
     groups |= {"held_out": held_out, "outliers": outliers}
     if "probe" in groups:

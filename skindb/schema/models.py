@@ -56,8 +56,7 @@ DIFFUSE_REFLECTANCE_TOTAL_ERROR = declare(
 EVEN_REFLECTION = declare(
     "float64 fitted/even_reflection() [1]",
     "fraction of light that the surface reflects as if it were diffuse, without colour, "
-    "at all surfels; it is not part of R_d, and pictures add it; negative if the lobes "
-    "reflect too much",
+    "at all surfels; it is not part of R_d, and pictures add it",
     "prior by condition: measured spectra and refractive indices of skin",
     Use.SURVIVES_EDIT,
 )
