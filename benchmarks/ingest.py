@@ -66,9 +66,7 @@ def decoding(folder: Path, stride: int) -> dict[str, dict[str, float]]:
     return times
 
 
-def measure(
-    capture: Path, *, spacing: float = 1.5, stride: int = 10, footprint: bool = False
-) -> dict[str, Any]:
+def measure(capture: Path, *, spacing: float = 1.5, stride: int = 10) -> dict[str, Any]:
     """Times of decoding and of the stages, and their ratio."""
     before = decoding(capture, stride)
     with (
@@ -79,7 +77,6 @@ def measure(
             skindb.open(folder),
             capture,
             spacing_mm=spacing,
-            footprint=footprint,
             progress=stages,
         )
         stages.end("commit")
@@ -109,11 +106,10 @@ def main(
     *,
     spacing: float = 1.5,
     stride: int = 10,
-    footprint: bool = False,
     json_: Path | None = None,
 ) -> None:
     """Print a table, and write the results."""
-    result = measure(capture, spacing=spacing, stride=stride, footprint=footprint)
+    result = measure(capture, spacing=spacing, stride=stride)
     rows = {
         f"decode {kind} ({spent['frames']:.0f})": spent
         for kind, spent in result["decoding"].items()

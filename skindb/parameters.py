@@ -316,11 +316,6 @@ class IngestParameters(Limited):
     soft
         Samples at the soft edges of shadows: excluded, or kept and divided by the
         visible fraction of the light.
-    footprint
-        Whether samples are means over the surfel's splat (elliptical weighted average)
-        or interpolated bilinearly.
-    visibility
-        Method for the visibility of surfels: "rays", or "splats" as in the paper.
     calibration
         What to do with a capture whose photographs contradict its calibration: refuse
         it, or record a warning.
@@ -347,15 +342,6 @@ class IngestParameters(Limited):
         "exclude",
         "Treatment of samples at soft shadow edges: excluded, or divided by the "
         "visible fraction of the light.",
-    )
-    footprint: bool = option(
-        False,
-        "Average each sample over the splat of its surfel instead of the pixels at its centre.",
-    )
-    visibility: Literal["rays", "splats"] = option(
-        "rays",
-        "Method for the visibility of lights and cameras. splats is that of the paper, "
-        "slower and less exact.",
     )
     calibration: Literal["refuse", "note"] = option(
         "refuse",

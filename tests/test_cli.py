@@ -365,9 +365,6 @@ def test_cli__fit_processes_takes_without_a_model_of_their_newest_capture(
             str(out / "c/V001"),
             "--spacing",
             "5",
-            "--visibility",
-            "splats",
-            "--footprint",
         ).returncode
         == 0
     )

@@ -234,23 +234,6 @@ def _spread_bits(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return x
 
 
-def splat_radius(vertices: Array, faces: Faces) -> Float64:
-    """Radius (v,) of the disc [mm] that stands for a vertex among its neighbours: 0.7
-    of its longest edge.
-
-    Discs of neighbours then overlap without gaps; 0 where a vertex has no edge.
-    """
-    out = np.zeros(len(vertices))
-    for k in range(3):
-        a = faces[:, k]
-        b = faces[:, (k + 1) % 3]
-        side = float64(vertices[a] - vertices[b])
-        length = np.linalg.norm(side, axis=1)
-        np.maximum.at(out, a, length)
-        np.maximum.at(out, b, length)
-    return 0.7 * out
-
-
 def closest_on_mesh(
     vertices: Array, faces: Faces, points: Array
 ) -> tuple[Index, Float64, Float64]:

@@ -36,9 +36,6 @@ MAX_HALF_FLOAT = 65504.0  # larger numbers are infinite in half precision
 # the sum of weights
 MIN_DARK_FRACTION = 0.999
 FLOOR = 1e-30  # keeps quotients finite where a picture is black
-# end of the weight (1 - q / FOOTPRINT_REACH)^2, whose second moments are those of a
-# Gaussian
-FOOTPRINT_REACH = 8.0
 
 
 class MergedView(NamedTuple):
@@ -60,7 +57,7 @@ class PointLight(NamedTuple):
 
 @kernel
 def pixel_spans(
-    surfels: BoolVector, pixels: Matrix32, spread: Matrix32, height: int, width: int
+    surfels: BoolVector, pixels: Matrix32, height: int, width: int
 ) -> IntMatrix:
     """Spans (h, 2) of the pixels that `gather` reads for surfels (n,) bool; see `develop`."""
     spans = np.empty((height, 2), np.int64)
@@ -68,14 +65,9 @@ def pixel_spans(
     spans[:, 1] = 0
     for i in range(surfels.shape[0]):
         if surfels[i]:
-            if spread.shape[0] and not np.isnan(spread[i, 0]):
-                left, right, top, bottom = _footprint_bounds(
-                    pixels[i, 0], pixels[i, 1], spread[i], height, width
-                )
-            else:
-                left, right, top, bottom = _bilinear_bounds(
-                    pixels[i, 0], pixels[i, 1], height, width
-                )
+            left, right, top, bottom = _bilinear_bounds(
+                pixels[i, 0], pixels[i, 1], height, width
+            )
             for row in range(top, bottom + 1):
                 spans[row, 0] = min(spans[row, 0], left)
                 spans[row, 1] = max(spans[row, 1], right + 1)
@@ -102,36 +94,11 @@ def _bilinear_bounds(
 
 
 @kernel
-def _footprint_bounds(
-    column: float, row: float, spread: Vector32, height: int, width: int
-) -> tuple[int, int, int, int]:
-    """First and last column and row of the pixels inside a footprint; an empty range if
-    it leaves the picture.
-
-    The mean over a part of a footprint would belong to another position.
-    """
-    xx = float(spread[0])
-    xy = float(spread[1])
-    yy = float(spread[2])
-    inside = column >= 0 and column <= width and row >= 0 and row <= height
-    if not (xx * yy - xy * xy > 0 and inside):
-        return 0, -1, 0, -1
-    left = int(np.ceil(column - 0.5 - np.sqrt(FOOTPRINT_REACH * xx)))
-    right = int(np.floor(column - 0.5 + np.sqrt(FOOTPRINT_REACH * xx)))
-    top = int(np.ceil(row - 0.5 - np.sqrt(FOOTPRINT_REACH * yy)))
-    bottom = int(np.floor(row - 0.5 + np.sqrt(FOOTPRINT_REACH * yy)))
-    if left < 0 or top < 0 or right >= width or bottom >= height:
-        return 0, -1, 0, -1
-    return left, right, top, bottom
-
-
-@kernel
 def gather(
     view: MergedView,
     surfels: BoolVector,
     light_fraction: Vector32,
     pixels: Matrix32,
-    spread: Matrix32,
     position: Matrix,
     normal: Matrix,
     light: PointLight,
@@ -152,10 +119,6 @@ def gather(
         all of it is visible.
     pixels
         (n, 2) float32 projections.
-    spread
-        (n, 3) float32 variances xx, xy, yy [px^2] of the footprint: weights (1 - q /
-        8)^2, where q is the squared distance in units of these variances. NaN, or (0,
-        3), for bilinear interpolation.
     position, normal
         (n, 3) float64 in mm, and unit vectors.
     light
@@ -179,10 +142,7 @@ def gather(
             continue
         if light_fraction.shape[0]:
             scale /= light_fraction[i]
-        if spread.shape[0] and not np.isnan(spread[i, 0]):
-            state = _footprint(view, pixels[i, 0], pixels[i, 1], spread[i], pixel)
-        else:
-            state = _bilinear(view, pixels[i, 0], pixels[i, 1], pixel)
+        state = _bilinear(view, pixels[i, 0], pixels[i, 1], pixel)
         outcome[i] = SINGLE if state == OK and pixel[4] < 2.0 else state
         if state == OK:
             for c in range(3):
@@ -210,12 +170,7 @@ def _square_over_falloff(light: PointLight, position: Vector, normal: Vector) ->
 
 @kernel
 def pixel_counts(
-    surfels: BoolVector,
-    pixels: Matrix32,
-    spread: Matrix32,
-    height: int,
-    width: int,
-    out: Vector32,
+    surfels: BoolVector, pixels: Matrix32, height: int, width: int, out: Vector32
 ) -> None:
     """Effective number of pixels (n,) that `gather` averages for each surfel; NaN where
     it takes no sample.
@@ -226,11 +181,7 @@ def pixel_counts(
             continue
         column = pixels[i, 0]
         row = pixels[i, 1]
-        if spread.shape[0] and not np.isnan(spread[i, 0]):
-            total, square = _footprint_weights(column, row, spread[i], height, width)
-            if total > 0:
-                out[i] = total * total / square
-        elif column >= 0 and column <= width and row >= 0 and row <= height:
+        if column >= 0 and column <= width and row >= 0 and row <= height:
             x = min(max(column - 0.5, 0.0), width - 1.0)
             y = min(max(row - 0.5, 0.0), height - 1.0)
             x = x - int(x)
@@ -238,29 +189,6 @@ def pixel_counts(
             out[i] = 1.0 / (
                 (x * x + (1.0 - x) * (1.0 - x)) * (y * y + (1.0 - y) * (1.0 - y))
             )
-
-
-@kernel
-def _footprint_weights(
-    column: float, row: float, spread: Vector32, height: int, width: int
-) -> tuple[float, float]:
-    """Sum of the weights of `_footprint`, and sum of their squares."""
-    left, right, top, bottom = _footprint_bounds(column, row, spread, height, width)
-    xx = float(spread[0])
-    xy = float(spread[1])
-    yy = float(spread[2])
-    scale = 1.0 / (FOOTPRINT_REACH * (xx * yy - xy * xy))
-    total = 0.0
-    square = 0.0
-    for v in range(top, bottom + 1):
-        dy = v + 0.5 - row
-        for u in range(left, right + 1):
-            dx = u + 0.5 - column
-            rest = 1.0 - (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) * scale
-            if rest > 0:
-                total += rest * rest
-                square += rest**4
-    return total, square
 
 
 @kernel
@@ -371,35 +299,6 @@ def _bilinear(view: MergedView, column: float, row: float, pixel: Vector) -> int
                 state = _add(view, left + right, top + down, weight, pixel)
                 if state == SATURATED:
                     return SATURATED
-    return DARK if pixel[3] > MIN_DARK_FRACTION else OK
-
-
-@kernel
-def _footprint(
-    view: MergedView, column: float, row: float, spread: Vector32, pixel: Vector
-) -> int:
-    """Weighted mean over an ellipse of pixels (Heckbert 1989, the elliptical weighted average)."""
-    left, right, top, bottom = _footprint_bounds(column, row, spread, *view.flag.shape)
-    xx = float(spread[0])
-    xy = float(spread[1])
-    yy = float(spread[2])
-    pixel[:] = 0.0
-    total = 0.0
-    scale = 1.0 / (FOOTPRINT_REACH * (xx * yy - xy * xy))
-    for v in range(top, bottom + 1):
-        dy = v + 0.5 - row
-        for u in range(left, right + 1):
-            dx = u + 0.5 - column
-            rest = 1.0 - (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) * scale
-            if rest > 0:
-                weight = rest * rest
-                total += weight
-                if _add(view, u, v, weight, pixel) == SATURATED:
-                    return SATURATED
-    if total == 0:
-        return NONE
-    for k in range(4):
-        pixel[k] /= total
     return DARK if pixel[3] > MIN_DARK_FRACTION else OK
 
 

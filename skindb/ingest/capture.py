@@ -75,7 +75,6 @@ from skindb.ingest.surfels import (
     SurfelSet,
     build_surfels,
     camera_visibility,
-    coarse_maps,
     light_visibility,
     site_positions,
 )
@@ -276,7 +275,6 @@ class _DomeStages:
     def _groups(self) -> dict[str, xr.Dataset]:
         surfels = self.run.surfels
         parameters = self.run.parameters
-        method = parameters.visibility
         mergers = frame_mergers(self.dome, self.run.faults, self.run.digests)
         for merger in mergers.values():
             self.run.faults += dark_faults(self.dome, merger)
@@ -284,12 +282,8 @@ class _DomeStages:
         # otherwise samples are those of other intensities, dark frames and cameras
         self.spool.resumable = not self.run.faults
         scene = RayScene(surfels.position, surfels.faces)
-        light_fraction = light_visibility(
-            surfels, self.dome.lights, scene, self.pool, method=method
-        )
-        sees = partial(
-            camera_visibility, surfels, scene=scene, pool=self.pool, method=method
-        )
+        light_fraction = light_visibility(surfels, self.dome.lights, scene, self.pool)
+        sees = partial(camera_visibility, surfels, scene=scene, pool=self.pool)
         visible, clear, pixels = sees(self.dome.cameras)
         self.run.report("visibility", 1, 1)
         check = CalibrationCheck(
@@ -378,7 +372,6 @@ class _DomeStages:
             self.run.report,
             kept=choose_photographs(self.dome, middle, parameters.photographs),
             soft=parameters.soft == "keep",
-            footprint=parameters.footprint,
         )
 
     def _labelled(
@@ -416,8 +409,6 @@ class _DomeStages:
             self.run.notes += dark_notes(dome, merger)
         self.run.notes += level_notes(dome, levels.highest, levels.clipped)
         self.run.notes += light_notes(dome, intensity, levels.median)
-        if self.run.parameters.visibility == "splats":
-            self.run.notes += coarse_maps(self.run.surfels, dome.lights, dome.cameras)
         calibration = lumitexels.calibration
         if calibration is not None:
             # empty if refused

@@ -37,7 +37,6 @@ def surfel_group(
         "surfel_position": surfels.position,
         "surfel_normal": surfels.normal,
         "surfel_area": surfels.area,
-        "surfel_radius": surfels.radius,
         "surfel_uv": surfels.uv,
     }
     coords = dict[str, list[str]]()

@@ -49,12 +49,6 @@ T = TypeVar("T")
 R = TypeVar("R")
 # views that are requested ahead of the one that is waited for: keeps eight threads busy
 MAX_PENDING_VIEWS = 24
-# px; wider footprints extend beyond the pixels that `clear` checks
-MAX_CLEAR_FOOTPRINT_PX = 0.75
-# px^2; about that of bilinear interpolation; larger values blur (3 % at 1 px^2,
-# measured)
-PIXEL_VARIANCE_PX2 = 0.2
-MIN_SPLAT_VARIANCE_PX2 = 0.25  # px^2: a splat with a radius of one pixel
 PenumbraRule = Literal["exclude", "keep"]  # samples at the soft edges of shadows
 # visible fraction of a light's disc below which a surfel is in the penumbra
 MIN_LIT_FRACTION = 0.999
@@ -72,7 +66,6 @@ class CameraSampling(NamedTuple):
 
     surfels: Mask  # (n,) those that it samples
     pixels: NDArray[np.float32]  # (n, 2)
-    spread: NDArray[np.float32]  # (n, 3) px^2, or (0, 3)
 
 
 @dataclass(frozen=True)
@@ -162,9 +155,6 @@ class Sampler:
         (light, camera) pairs whose merged radiance is kept.
     soft
         Whether samples are divided by the visible fraction of the light.
-    footprint
-        Whether samples are means over the surfel's splat; otherwise they are
-        interpolated bilinearly.
     faults
         Receives the faults of the views.
     """
@@ -177,7 +167,6 @@ class Sampler:
     progress: Progress = silent
     kept: Collection[Pair] = ()
     soft: bool = False
-    footprint: bool = False
     faults: list[Fault] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -288,7 +277,7 @@ class Sampler:
         height, width, _ = frames[0].shape
         spans = None
         if not whole:
-            spans = pixel_spans(surfels, shot.pixels, shot.spread, height, width)
+            spans = pixel_spans(surfels, shot.pixels, height, width)
         usable = np.zeros((height, width), np.uint8)
         radiance, flag = merger.merge(frames, spans, usable=usable)
         merged = MergedView(radiance, flag, usable)
@@ -332,7 +321,6 @@ class Sampler:
             surfels,
             light_fraction,
             shot.pixels,
-            shot.spread,
             check.surfels.position,
             check.surfels.normal,
             PointLight(
@@ -347,39 +335,11 @@ class Sampler:
         check = self.check
         camera = check.dome.cameras[c]
         surfels = check.clear[:, c] & _frontal(camera, check.surfels)
-        spread = np.zeros((0, 3), np.float32)
-        if self.footprint:
-            spread = footprints(check.surfels, camera)
-            wide = spread[:, [0, 2]].max(axis=1) > MAX_CLEAR_FOOTPRINT_PX**2
-            surfels &= ~(wide & grown(check.surfels.faces, ~check.clear[:, c]))
-        return CameraSampling(surfels, np.ascontiguousarray(check.pixels[:, c]), spread)
+        return CameraSampling(surfels, np.ascontiguousarray(check.pixels[:, c]))
 
 
 def _photograph_name(pair: Pair) -> str:
     return "photograph-{}-{}".format(*pair)
-
-
-def footprints(surfels: SurfelSet, camera: CameraRecord) -> NDArray[np.float32]:
-    """Variances xx, xy, yy (n, 3) px^2 of the splats in a picture, and of a pixel
-    (Heckbert 1989, section 3).
-
-    The variance of a disc in each direction is a quarter of its squared radius. Its
-    diameters are projected with the distortion of the lens. NaN where the splat is no
-    larger than the footprint of bilinear interpolation.
-    """
-    helper = np.eye(3)[np.abs(surfels.normal).argmin(axis=1)]
-    arm = np.cross(surfels.normal, helper)
-    length = np.maximum(np.linalg.norm(arm, axis=1), 1e-30)
-    arm *= (surfels.radius / 2 / length)[:, None]
-    spread = np.zeros((len(arm), 3))
-    for half in (arm, np.cross(surfels.normal, arm)):
-        ahead = camera.project(surfels.position + half)
-        behind = camera.project(surfels.position - half)
-        x, y = ((ahead - behind) / 2).T
-        spread += np.stack([x * x, x * y, y * y], axis=1)
-    spread[spread[:, [0, 2]].max(axis=1) < MIN_SPLAT_VARIANCE_PX2] = np.nan
-    pixel = np.array([PIXEL_VARIANCE_PX2, 0, PIXEL_VARIANCE_PX2])
-    return np.asarray(spread + pixel, np.float32)
 
 
 def _in_turn(pool: Executor, call: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:

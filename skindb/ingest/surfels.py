@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import Literal
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,13 +25,11 @@ from skindb.geometry.mesh import (
     carry_points,
     closest_on_mesh,
     morton_order,
-    splat_radius,
     subdivide,
     vertex_areas,
     vertex_normals,
 )
 from skindb.geometry.rays import RayScene
-from skindb.geometry.splats import THRESHOLD, SplatScene
 from skindb.types import Float64, Index, Mask
 
 MAX_SURFELS = 2_500_000  # the samples of this many surfels in a full dome take 36 GB
@@ -40,14 +38,11 @@ MAX_SURFELS = 2_500_000  # the samples of this many surfels in a full dome take 
 CROPPED_LANDMARK_MM = 0.5
 NECK_STRIP_HALF_WIDTH_MM = 15.0  # mm; half width of the strip at the front of the neck
 Half = NDArray[np.float16]
-Method = Literal["rays", "splats"]
 VisibilityTest = Callable[[Index], Mask]  # surfels (m,) that face an eye -> (m,)
 # points of a light's disc besides its centre; each stands for a fifth of its area
 RING_POINTS = 4
 # one surfel in this many is tested for all points of a disc, to find isolated penumbrae
 SURFELS_PER_PROBE = 16
-# of a depth map's pixels over the wanted width; wider ones are reported
-MAX_PIXEL_WIDTH_RATIO = 1.05
 EDGE_PX = 1.5  # pixels within this distance may contribute to a sample
 STRIP_ROWS = 32  # rows of a depth map at a time
 SURFELS_PER_BLOCK = 1 << 14  # surfels at a time
@@ -63,7 +58,6 @@ class SurfelSet:
     position: Float64  # (n, 3) mm
     normal: Float64  # (n, 3)
     area: Float64  # (n,) mm2
-    radius: Float64  # (n,) mm, of the splat
     uv: NDArray[np.float32]  # (n, 2)
     faces: Index  # (f, 3)
     region_names: tuple[str, ...]
@@ -102,7 +96,6 @@ def build_surfels(capture: Capture, *, spacing_mm: float) -> SurfelSet:
         position=vertices[order],
         normal=vertex_normals(vertices, faces)[order],
         area=vertex_areas(vertices, faces)[order],
-        radius=splat_radius(vertices, faces)[order],
         uv=uv[order],
         faces=rank[faces],
         region_names=names,
@@ -235,19 +228,13 @@ def light_visibility(
     lights: Sequence[LightRecord],
     scene: RayScene,
     pool: Executor,
-    *,
-    method: Method = "rays",
 ) -> Half:
     """Visible fraction (n, light) of the lights' discs; 0 where the surfel faces away
     from the centre.
 
     All points of a disc are tested only where their visibility may differ: at the edge
-    of the shadow of the centre, and from there on as long as a penumbra is found. The
-    methods are rays, and splats as in the paper: measured on true heads, the two differ
-    by less than 0.1 % except at eyelids and lips, where rays are right more often (98.1
-    against 97.7 %, 98.9 against 98.3 %); splats with discs take four times as long.
+    of the shadow of the centre, and from there on as long as a penumbra is found.
     """
-    look = _visibility_test(surfels, scene, method)
 
     def visible_fraction(light: LightRecord) -> Half:
         fraction = np.zeros(len(surfels.position), np.float16)
@@ -255,11 +242,11 @@ def light_visibility(
         facing = np.einsum("ni,ni->n", way, surfels.normal) > 0
         indices = np.flatnonzero(facing)
         centre, *ring = disc_points(light)
-        fraction[indices] = look(centre)(indices)
+        fraction[indices] = _visible(surfels, scene, centre, indices)
         if ring:
             start = mixed(surfels.faces, fraction > 0)
             start[::SURFELS_PER_PROBE] = True
-            tests = [look(point) for point in ring]
+            tests = [partial(_visible, surfels, scene, point) for point in ring]
             _add_penumbrae(fraction, start & facing, surfels.faces, facing, tests)
         return fraction
 
@@ -295,42 +282,11 @@ def _add_penumbrae(
         front = np.flatnonzero(ring_surfels)
 
 
-def _visibility_test(
-    surfels: SurfelSet, scene: RayScene, method: Method
-) -> Callable[[Float64], VisibilityTest]:
-    """Function from an eye (3,) in mm to the visibility of surfels from it, by the method."""
-    if method == "rays":
-        position = surfels.position
-        normal = surfels.normal
-        return lambda eye: (
-            lambda at: ~scene.occluded(position, eye[None], normal=normal, chosen=at)
-        )
-    if method == "splats":
-        splats = SplatScene(surfels.position, surfels.normal, surfels.radius)
-
-        def look(eye: Float64) -> VisibilityTest:
-            maps = splats.draw(eye)
-            return lambda at: splats.visible_fraction(eye, at, maps=maps) >= THRESHOLD
-
-        return look
-    raise ValueError(f'method must be "rays" or "splats", not {method!r}')
-
-
-def coarse_maps(
-    surfels: SurfelSet, lights: Sequence[LightRecord], cameras: Sequence[CameraRecord]
-) -> list[str]:
-    """A warning if the splats of the surfels need finer depth maps than the limit
-    allows for a light or camera.
-    """
-    splats = SplatScene(surfels.position, surfels.normal, surfels.radius)
-    eyes = [*(light.position for light in lights), *(c.centre for c in cameras)]
-    ratio = max(splats.coarsening(eye) for eye in eyes)
-    if ratio < MAX_PIXEL_WIDTH_RATIO:
-        return []
-    return [
-        f"depth maps of splats: pixels are up to {ratio:.1f} times too wide; use "
-        "rays, which are exact"
-    ]
+def _visible(surfels: SurfelSet, scene: RayScene, eye: Float64, chosen: Index) -> Mask:
+    """Whether chosen surfels (m,) are visible from a point (3,) in mm."""
+    return ~scene.occluded(
+        surfels.position, eye[None], normal=surfels.normal, chosen=chosen
+    )
 
 
 def disc_points(light: LightRecord) -> Float64:
@@ -355,8 +311,6 @@ def camera_visibility(
     cameras: Sequence[CameraRecord],
     scene: RayScene,
     pool: Executor,
-    *,
-    method: Method = "rays",
 ) -> tuple[Half, Mask, NDArray[np.float32]]:
     """Visibility of the surfels in each camera.
 
@@ -369,7 +323,6 @@ def camera_visibility(
     pixels : ndarray
         (n, camera, 2) distorted projections.
     """
-    look = _visibility_test(surfels, scene, method)
     count = len(surfels.position)
     # the columns of cameras are used one by one
     visible = np.zeros((len(cameras), count), np.float16).T
@@ -380,7 +333,7 @@ def camera_visibility(
         camera = cameras[c]
         projected, candidate = _in_picture(surfels, camera)
         indices = np.flatnonzero(candidate)
-        indices = indices[look(camera.centre)(indices)]
+        indices = indices[_visible(surfels, scene, camera.centre, indices)]
         visible[indices, c] = 1
         pixels[:, c] = projected
         clear[indices, c] = _clear(camera, scene, surfels, projected, indices)

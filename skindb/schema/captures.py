@@ -78,11 +78,6 @@ SOFT_LIGHT_COUNT = declare(
     "int32 surfels/soft_light_count(surfel) [1]",
     "lights whose disc is partly visible from the surfel, at the soft edge of a shadow",
 )
-SURFEL_RADIUS = declare(
-    "float32 surfels/surfel_radius(surfel) [mm]",
-    "radius of the disc that covers the gap to the neighbours: 0.7 of the longest edge",
-    "Zwicker et al. 2001",
-)
 SURFEL_UV = declare(
     "float32 surfels/surfel_uv(surfel, uv) [1]",
     "texture coordinates, v = 0 at the top row",

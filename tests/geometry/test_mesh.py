@@ -23,7 +23,6 @@ from skindb.geometry.mesh import (
     fans,
     loop_matrix,
     morton_order,
-    splat_radius,
     subdivide,
     vertex_areas,
     vertex_normals,
@@ -174,14 +173,6 @@ def test_vertex_areas__give_each_corner_a_third():
         area = (half * (half - sides[0]) * (half - sides[1]) * (half - sides[2])) ** 0.5
         expected[[a, b, c]] += area / 3
     np.testing.assert_allclose(vertex_areas(v, f), expected, rtol=1e-10)
-
-
-def test_splat_radius__is_of_the_longest_edge():
-    vertices = np.array([[0.0, 0, 0], [3, 0, 0], [0, 4, 0], [0, 0, 1], [9, 9, 9]])
-    faces = np.array([[0, 1, 2], [0, 2, 3]])
-    np.testing.assert_allclose(
-        splat_radius(vertices, faces), 0.7 * np.array([4, 5, 5, np.sqrt(17), 0])
-    )
 
 
 def every_distance(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -261,8 +261,6 @@ def test_ingest_capture__provenance(take):
         "spacing_mm": 4.0,
         "photographs": 2,
         "soft": "exclude",
-        "footprint": False,
-        "visibility": "rays",
         "calibration": "refuse",
         "refine": "auto",
     }
@@ -331,34 +329,6 @@ def test_ingest_capture__without_dome_and_probe_keeps_the_surface(
     assert take["surfels"].sizes["surfel"] > 100
 
 
-@pytest.mark.slow
-def test_ingest_capture__by_splats_and_footprints_sees_the_same_face(
-    take, capture_folder, tmp_path
-):
-    db = Database(tmp_path / "db")
-    ingest_take(
-        db,
-        capture_folder,
-        spacing_mm=4.0,
-        photographs=0,
-        visibility="splats",
-        footprint=True,
-    )
-    other = db.read("capture", "T001")
-    seen, again = (
-        one["surfels"]["light_visible_fraction"].values > 0.5 for one in (take, other)
-    )
-    # a smooth face: only at the horizon can they differ
-    assert (seen == again).mean() > 0.99
-    a, b = (
-        one["samples"]["reflectance_sample"].values.astype(float)
-        for one in (take, other)
-    )
-    assert not np.array_equal(a, b, equal_nan=True)
-    both = np.isfinite(a) & np.isfinite(b)
-    assert abs(np.median(b[both] / a[both]) - 1) < 0.01
-
-
 def test_atlas_group__names_the_weights_that_made_the_map(capture_folder, monkeypatch):
     capture = read_capture(capture_folder)
     assert atlas_group(build_surfels(capture, spacing_mm=6.0)).attrs == {
@@ -371,21 +341,3 @@ def test_atlas_group__names_the_weights_that_made_the_map(capture_folder, monkey
     assert atlas_group(build_surfels(capture, spacing_mm=6.0)).attrs == {
         "weights": "mean_value"
     }
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("largest", [4096, 64])
-def test_ingest_capture__depth_maps_too_coarse_for_the_splats_are_told(
-    capture_folder, tmp_path, monkeypatch, largest
-):
-    monkeypatch.setattr("skindb.geometry.splats.MAX_MAP_SIDE_PX", largest)
-    db = Database(tmp_path / "db")
-    record = ingest_take(
-        db, capture_folder, spacing_mm=6.0, photographs=0, visibility="splats"
-    )
-    notes = record.provenance["summary"]["notes"]
-    assert (
-        notes == []
-        if largest == 4096
-        else "too wide; use rays, which are exact" in notes[0]
-    )

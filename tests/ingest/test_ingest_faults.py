@@ -77,7 +77,7 @@ def take_frames(folder, dome, rng):
                 )
 
 
-def lumitexels_of(dome, surfels, folder, *, footprint):
+def lumitexels_of(dome, surfels, folder):
     """What a fit reads of the frames that lie there."""
     n = len(surfels.position)
     intensity = np.tile(INTENSITY, (len(dome.lights), 1))
@@ -89,7 +89,7 @@ def lumitexels_of(dome, surfels, folder, *, footprint):
         )
         light = np.ones((n, shape[0]), np.float16)
         check = CalibrationCheck(dome, surfels, light, clear, pixels, intensity)
-        sampler = Sampler(check, light > 0, mergers, spool, pool, footprint=footprint)
+        sampler = Sampler(check, light > 0, mergers, spool, pool)
         found = sampler.lumitexels(check=False)
         groups = {
             "samples": sample_group(dome, found).compute(),
@@ -102,9 +102,8 @@ def lumitexels_of(dome, surfels, folder, *, footprint):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("footprint", [False, True])
 def test_sample_variance__z_scores_of_repeated_frames_have_unit_variance(
-    capture_folder, tmp_path, footprint
+    capture_folder, tmp_path
 ):
     """Both exposures usable, the long one white, and lights at 350 to 500 mm, three of
     four off the axis.
@@ -128,15 +127,13 @@ def test_sample_variance__z_scores_of_repeated_frames_have_unit_variance(
     dome = replace(capture.dome, cameras=cameras, lights=lights)
     surfels = build_surfels(capture, spacing_mm=4.0)
     rng = np.random.default_rng(11)
-    if footprint:
-        surfels = replace(surfels, radius=np.full(len(surfels.position), 6.0))
     take_frames(capture_folder, dome, None)
-    true = lumitexels_of(dome, surfels, tmp_path / "true", footprint=footprint)
+    true = lumitexels_of(dome, surfels, tmp_path / "true")
     expected = np.nan_to_num(true["reflectance_sample"].values.astype(np.float64))
     scores = []
     for i in range(REPEATS):
         take_frames(capture_folder, dome, rng)
-        noisy = lumitexels_of(dome, surfels, tmp_path / str(i), footprint=footprint)
+        noisy = lumitexels_of(dome, surfels, tmp_path / str(i))
         variance = sample_variance(noisy, expected).values
         scores.append(
             (noisy["reflectance_sample"].values - expected) / np.sqrt(variance)
@@ -155,7 +152,7 @@ def test_sample_variance__z_scores_of_repeated_frames_have_unit_variance(
     # neighbours share pixels: some 3,000 independent samples in the smallest part,
     # whose deviation is known to 1.3 %; the line of the variance may be 1.5 % off in
     # sigma, and the vignette is one for each camera
-    for part in (white, dark) if footprint else (white, wide & dark, ~wide & dark):
+    for part in (white, wide & dark, ~wide & dark):
         some = z[:, part]
         some = some[np.isfinite(some)]
         assert some.size > 5000
@@ -223,7 +220,6 @@ def test_sample_noise__is_unknown_without_electrons(capture_folder, tmp_path):
         replace(capture.dome, cameras=(silent, *others)),
         build_surfels(capture, spacing_mm=8.0),
         tmp_path / "a",
-        footprint=False,
     )
     assert noise_inputs(found) == ()
 

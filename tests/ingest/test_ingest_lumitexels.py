@@ -6,7 +6,7 @@ from threading import Barrier
 
 import numpy as np
 import pytest
-from sphere import ALBEDO, BLACK, INTENSITY, WHITE, save
+from sphere import BLACK, INTENSITY, WHITE, save
 
 from skindb.calibration.radiance import frame_merger
 from skindb.format.folder import read_capture
@@ -16,11 +16,9 @@ from skindb.ingest.capture import MAX_THREADS
 from skindb.ingest.consistency import CalibrationCheck
 from skindb.ingest.lumitexels import (
     LINEAR_NOISE_FLOOR,
-    PIXEL_VARIANCE_PX2,
     Sampler,
     _in_turn,
     choose_photographs,
-    footprints,
     fully_lit,
     noise_floor,
 )
@@ -65,11 +63,10 @@ def test_fully_lit__keeps_a_pixel_of_the_widest_camera_away_from_a_shadow(captur
     place = np.stack([x, y, 0 * x], axis=1)
     faces = np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])
     up = np.tile([0.0, 0, 1], (len(place), 1))
-    one = np.ones(len(place))
     area = vertex_areas(place, faces)
     uv = place[:, :2].astype(np.float32)
     none = np.zeros((len(place), 0), bool)
-    plane = SurfelSet(place, up, area, one, uv, faces, (), none, "intrinsic")
+    plane = SurfelSet(place, up, area, uv, faces, (), none, "intrinsic")
     one = capture.dome.cameras[0]
     fine, coarse = (
         replace(
@@ -136,7 +133,7 @@ def test_noise_floor__of_linear_files(surfels, capture):
     assert noise_floor(dome, np.tile(INTENSITY, (4, 1)), surfels) == LINEAR_NOISE_FLOOR
 
 
-def sampled(dome, surfels, folder, *, share=None, lit=None, footprint=False):
+def sampled(dome, surfels, folder, *, share=None, lit=None):
     """Every view of a dome, by rays that say what is clear; samples in memory."""
     mergers = {camera.id: frame_merger(dome, camera) for camera in dome.cameras}
     shape = (len(dome.lights), len(dome.cameras))
@@ -159,7 +156,6 @@ def sampled(dome, surfels, folder, *, share=None, lit=None, footprint=False):
             spool,
             pool,
             soft=share is not None,
-            footprint=footprint,
         )
         found = sampler.lumitexels(check=False)
         return clear, replace(found, sample=found.sample.compute())
@@ -174,28 +170,6 @@ def test_sampler__kept_soft_edges_are_divided_by_the_share(capture, surfels, tmp
     np.testing.assert_allclose(
         soft.sample, 2 * plain.sample.astype(np.float64), rtol=2**-10
     )
-
-
-def test_sampler__footprints_of_a_smooth_sphere_are_less_noisy(capture, tmp_path):
-    """Splats of 1.5 pixels: the mean over them is the point's value, with a fraction of
-    its noise.
-    """
-    coarse = build_surfels(capture, spacing_mm=8.0)
-    coarse = replace(coarse, radius=np.full(len(coarse.position), 4.5))
-    _, point = sampled(capture.dome, coarse, tmp_path / "a")
-    _, mean = sampled(capture.dome, coarse, tmp_path / "b", footprint=True)
-    both = np.isfinite(mean.sample).all(-1) & np.isfinite(point.sample).all(-1)
-    place = (
-        coarse.position / np.linalg.norm(coarse.position, axis=1, keepdims=True) * 80.0
-    )
-    way = np.array([light.position for light in capture.dome.lights]) - place[:, None]
-    cosine = np.einsum("nji,ni->nj", way, place) / 80 / np.linalg.norm(way, axis=-1)
-    truth = cosine[:, :, None, None] * ALBEDO / np.pi
-    both &= cosine[:, :, None] > 0.5
-    error = [(found.sample / truth - 1)[both] for found in (point, mean)]
-    assert both.sum() > 500
-    assert np.std(error[1]) < 0.7 * np.std(error[0])
-    assert abs(np.median(error[1])) < 0.003
 
 
 def test_describe_samples__one_camera_one_light_and_none(capture, surfels, tmp_path):
@@ -286,36 +260,6 @@ def test_fully_lit__keeps_soft_edges_but_not_full_shadow(surfels, capture):
     assert lit[:, 0].all()
     ring = set(surfels.faces[(surfels.faces == 100).any(axis=1)].ravel())
     assert set(np.flatnonzero(~lit[:, 1])) == ring
-
-
-def test_footprints__of_a_disc_that_faces_the_camera_or_is_tilted(surfels, capture):
-    """By hand: f r / (2 z) is the standard deviation; tilted by 60 degrees it halves
-    across the axis.
-    """
-    tilt = np.array([[0, 0, 1], [np.sin(np.pi / 3), 0, 0.5]])
-    two = replace(
-        surfels, position=np.zeros((2, 3)), normal=tilt, radius=np.array([4.0, 4.0])
-    )
-    ahead = {
-        "R": np.diag([1.0, -1, -1]),
-        "t": np.array([0, 0, 400.0]),
-        "distortion": np.zeros(5),
-    }
-    camera = replace(capture.dome.cameras[0], **ahead)
-    np.testing.assert_array_equal(
-        np.isnan(footprints(replace(two, radius=two.radius / 2), camera)[:, 0]), True
-    )
-    a, b = footprints(two, camera)
-    square = (camera.K[0, 0] * 4 / 2 / 400) ** 2
-    np.testing.assert_allclose(
-        a, [square + PIXEL_VARIANCE_PX2, 0, square + PIXEL_VARIANCE_PX2], rtol=1e-5
-    )
-    np.testing.assert_allclose(
-        b,
-        [square / 4 + PIXEL_VARIANCE_PX2, 0, square + PIXEL_VARIANCE_PX2],
-        rtol=1e-4,
-        atol=1e-6,
-    )
 
 
 def test_cleaning_lines__with_places_say_where():

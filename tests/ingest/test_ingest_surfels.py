@@ -9,9 +9,8 @@ import pytest
 from sphere import RADIUS, look_at
 
 from skindb.errors import InputError
-from skindb.geometry._mesh_kernels import grown
 from skindb.geometry.camera import camera_centre, pixel_rays, project
-from skindb.geometry.mesh import morton_order, splat_radius, subdivide, vertex_normals
+from skindb.geometry.mesh import morton_order, subdivide, vertex_normals
 from skindb.geometry.rays import RayScene
 from skindb.ingest.surfels import (
     SurfelSet,
@@ -41,7 +40,6 @@ def plate_with_wall(spacing=1.0):
     return SurfelSet(
         plate,
         normal,
-        one,
         one,
         plate[:, :2],
         faces,
@@ -138,12 +136,10 @@ def head_and_places(count):
     faces = np.argsort(order)[faces]
     one = np.ones(len(order))
     normal = vertex_normals(position, faces)
-    radius = splat_radius(position, faces)
     surfels = SurfelSet(
         position,
         normal,
         one,
-        radius,
         position[:, :2],
         faces,
         (),
@@ -205,43 +201,6 @@ def test_light_visibility__finds_a_penumbra_with_no_shadow_of_the_centre_beside_
     # - 31 = 13.02 mm
     expected = np.where(np.arange(-20, 21) > 13.02, 0.8, 1).astype(np.float16)
     np.testing.assert_array_equal(share[1:-1], np.tile(expected, (39, 1)))
-
-
-def test_light_visibility__the_two_methods_agree_away_from_edges(capture):
-    """99.8 % of the surfels that are steeper than cos 0.1 and farther than 3 rings from
-    the edge of a shadow.
-    """
-    surfels, scene, places = head_and_places(8)
-    lights = [
-        replace(capture.dome.lights[0], position=p, axis=-p / 700, disc_radius=0.0)
-        for p in places
-    ]
-    with ThreadPoolExecutor(2) as pool:
-        rays = light_visibility(surfels, lights, scene, pool)
-        splats = light_visibility(surfels, lights, scene, pool, method="splats")
-    shadow = rays == 0
-    lit = rays > 0
-    dark = rays == 0
-    for _ in range(4):
-        lit, dark = (
-            np.stack(
-                [grown(surfels.faces, np.ascontiguousarray(one)) for one in mask.T],
-                axis=1,
-            )
-            for mask in (lit, dark)
-        )
-    way = places[None] - surfels.position[:, None]
-    cosine = np.einsum("nlc,nc->nl", way, surfels.normal) / np.linalg.norm(way, axis=2)
-    sure = ~(lit & dark) & (cosine > 0.1)
-    assert (shadow & sure).sum() > 1000
-    assert (rays == splats)[sure].mean() > 0.998
-
-
-def test_light_visibility__refuses_another_method(surfels, capture):
-    with pytest.raises(ValueError, match='"rays" or "splats", not \'guess\''):
-        light_visibility(
-            surfels, [], RayScene(surfels.position, surfels.faces), None, method="guess"
-        )
 
 
 def test_light_visibility__half_sphere_sees_by_its_normal(surfels, capture):
@@ -350,25 +309,21 @@ def test_camera_visibility__clear_pixels_by_a_twin(surfels, capture, distortion)
         assert 0.1 < expected.mean() < 0.99
 
 
-@pytest.mark.parametrize("method", ["rays", "splats"])
-def test_visibility__from_inside_the_head_nothing_is_seen(surfels, capture, method):
+def test_visibility__from_inside_the_head_nothing_is_seen(surfels, capture):
     scene = RayScene(surfels.position, surfels.faces)
     camera = replace(
         capture.dome.cameras[0], t=-capture.dome.cameras[0].R @ np.array([0, 5.0, 20])
     )
     light = replace(capture.dome.lights[0], position=np.array([0, 5.0, 20]))
     with ThreadPoolExecutor(1) as pool:
-        visible, clear, _ = camera_visibility(
-            surfels, [camera], scene, pool, method=method
-        )
-        share = light_visibility(surfels, [light], scene, pool, method=method)
+        visible, clear, _ = camera_visibility(surfels, [camera], scene, pool)
+        share = light_visibility(surfels, [light], scene, pool)
     assert not visible.any()
     assert not clear.any()
     assert not share.any()
 
 
-@pytest.mark.parametrize("method", ["rays", "splats"])
-def test_visibility__one_triangle(capture, method):
+def test_visibility__one_triangle(capture):
     position = np.array([[-30.0, -30, 0], [30, -30, 0], [0, 40, 0]])
     one = np.ones(3)
     normal = np.array([[0, 0, 1.0], [0, 0, 1], [np.nan, 0, 1]])
@@ -377,7 +332,6 @@ def test_visibility__one_triangle(capture, method):
         position,
         normal,
         one,
-        0 * one,
         position[:, :2],
         faces,
         (),
@@ -387,11 +341,9 @@ def test_visibility__one_triangle(capture, method):
     scene = RayScene(position, faces)
     with ThreadPoolExecutor(1) as pool:
         visible, _, _ = camera_visibility(
-            surfels, capture.dome.cameras[:1], scene, pool, method=method
+            surfels, capture.dome.cameras[:1], scene, pool
         )
-        share = light_visibility(
-            surfels, capture.dome.lights[:1], scene, pool, method=method
-        )
+        share = light_visibility(surfels, capture.dome.lights[:1], scene, pool)
     assert visible[:, 0].tolist() == [1, 1, 0]
     assert share[:, 0].tolist() == [1, 1, 0]
 
