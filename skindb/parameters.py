@@ -49,6 +49,8 @@ SURFACE_ENERGY = {
 }
 # powder, makeup, and conditions without a source
 SURFACE_ENERGY_ELSEWHERE = (0.040, 0.015)
+# RMS angle of the normals of a scan that does not state it
+SCAN_ERROR_DEGREES = 3.0
 VIRTUAL_SEED = 2005
 VIRTUAL_EXPOSURES = 2  # of every view of the virtual dome
 CONDITIONS = ("normal", "lotion", "powder", "sweat", "hot", "cold", "makeup", "tan")

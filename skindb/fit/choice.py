@@ -18,7 +18,7 @@ from skindb.fit.corrections import (
     estimate_light_gains,
     without_bounce,
 )
-from skindb.fit.lumitexels import directions
+from skindb.fit.lumitexels import directions, scan_error
 from skindb.fit.normals import estimate_normals
 from skindb.fit.plan import fitted_part, surface_of
 from skindb.fit.quality import HELD_OUT_ERRORS
@@ -88,7 +88,7 @@ class Trial:
         one_lobe = FitParameters(surface="ggx", eta=self.parameters.eta)
         surface = surface_of(few, one_lobe, None)
         part = fitted_part(few, self.held_out)
-        fitted = estimate_normals(part, eta=one_lobe.eta)
+        fitted = estimate_normals(part, eta=one_lobe.eta, scan_error=scan_error(part))
         fitted = fitted.merge(
             estimate_diffuse_reflectance(part.merge(fitted), eta=one_lobe.eta)
         )

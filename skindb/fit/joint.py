@@ -18,6 +18,7 @@ from skindb.fit.lumitexels import (
 )
 from skindb.fit.surface import MIN_SAMPLES, noise_floor
 from skindb.optics.diffusion import dipole_s
+from skindb.parameters import SCAN_ERROR_DEGREES
 from skindb.reflectance.joint import JointFit, refine_block
 from skindb.reflectance.model import MIN_LOBE_WIDTH, Comparison
 from skindb.schema import check
@@ -45,7 +46,10 @@ REFINED = (
 
 
 def refine_jointly(
-    lumitexels: xr.Dataset, *, eta: float = 1.3, scan_error: float = 3.0
+    lumitexels: xr.Dataset,
+    *,
+    eta: float = 1.3,
+    scan_error: float = SCAN_ERROR_DEGREES,
 ) -> xr.Dataset:
     """Normal and R_d, estimated together with the surface from estimates in sequence.
 

@@ -12,6 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
+from skindb.parameters import SCAN_ERROR_DEGREES
 from skindb.reflectance.model import Block, Noise, typical_noise
 from skindb.schema import check, label, variables
 from skindb.types import Array
@@ -43,8 +44,8 @@ REQUIRED = {
 }
 OPTIONAL = {
     "samples": (SHOT, *NOISE_SAMPLES),
-    "dome": (*NOISE_LIGHTS, *POLARISATION),
-    "surfels": (),
+    "dome": (*NOISE_LIGHTS, *POLARISATION, variables.RELATIVE_REFLECTANCE),
+    "surfels": (variables.SCAN_NORMAL_ERROR,),
 }
 
 
@@ -91,6 +92,16 @@ def lumitexels(capture: xr.DataTree) -> xr.Dataset:
     # samples for a full dome
     small = [name for name in merged.data_vars if name != "reflectance_sample"]
     return merged.assign({name: merged[name].load() for name in small})
+
+
+def scan_error(lumitexels: xr.Dataset) -> float:
+    """RMS angle [degree] of the scan's normals to the true ones."""
+    return float(lumitexels.get(variables.SCAN_NORMAL_ERROR, SCAN_ERROR_DEGREES))
+
+
+def relative_reflectance(lumitexels: xr.Dataset) -> bool:
+    """Whether R_d has an unknown factor per channel."""
+    return bool(lumitexels.get(variables.RELATIVE_REFLECTANCE, 0))
 
 
 def disc_angle(lumitexels: xr.Dataset) -> float:

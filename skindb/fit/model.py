@@ -27,7 +27,7 @@ from skindb.fit.corrections import (
 )
 from skindb.fit.energy import crossed_gloss, energy_prior, without_even_reflection
 from skindb.fit.joint import refine_jointly
-from skindb.fit.lumitexels import lumitexels
+from skindb.fit.lumitexels import lumitexels, relative_reflectance, scan_error
 from skindb.fit.normals import estimate_normals
 from skindb.fit.plan import fitted_part, hold_out, plan_fit, surface_of
 from skindb.fit.quality import error_of_misfit, find_obstructed, suspects
@@ -155,7 +155,7 @@ def first_pass(
         "parameters": parameters.as_dict() | surface.settings,
         "corrections": reasons,
         "seconds": timer.seconds,
-        "skipped": plan.explain() if plan.omissions else [],
+        "skipped": plan.skipped(),
     }
     return first
 
@@ -185,10 +185,13 @@ def _fit_surfels(
     every block of samples is read once.
     """
     eta = parameters.eta
-    estimates = estimate_normals(samples, eta=eta)
+    prior = scan_error(samples)
+    estimates = estimate_normals(samples, eta=eta, scan_error=prior)
     diffuse = estimate_diffuse_reflectance(samples.merge(estimates), eta=eta)
     estimates = estimates.merge(diffuse)
-    estimates = estimates.assign(refine_jointly(samples.merge(estimates), eta=eta))
+    estimates = estimates.assign(
+        refine_jointly(samples.merge(estimates), eta=eta, scan_error=prior)
+    )
     terms = fit_surface(
         samples.merge(estimates), surface=surface, mode=parameters.mode, eta=eta
     )
@@ -248,7 +251,10 @@ def second_pass(
             eta=parameters.eta,
         )
     groups = _groups(capture, fitted.assign(judged), basis, gains)
-    prior = energy_prior(str(capture.attrs.get("condition", "normal")), parameters)
+    prior = None
+    if not relative_reflectance(samples):
+        condition = str(capture.attrs.get("condition", "normal"))
+        prior = energy_prior(condition, parameters)
     groups["fitted"], energy = without_even_reflection(
         groups["fitted"], prior, crossed_gloss(samples, parameters.eta)
     )

@@ -9,6 +9,7 @@ from skindb.elementwise import elementwise
 from skindb.fit._normal_kernels import normals_block
 from skindb.fit.lumitexels import GEOMETRY
 from skindb.jit import sample_bits
+from skindb.parameters import SCAN_ERROR_DEGREES
 from skindb.schema import check
 from skindb.types import Array
 
@@ -21,7 +22,7 @@ def estimate_normals(
     *,
     method: str = "combined",
     eta: float = 1.3,
-    scan_error: float = 3.0,
+    scan_error: float = SCAN_ERROR_DEGREES,
 ) -> xr.Dataset:
     """Unit normals per surfel.
 

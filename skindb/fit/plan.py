@@ -9,14 +9,16 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
-from skindb.fit.lumitexels import disc_angle, lumitexels
+from skindb.fit.lumitexels import disc_angle, lumitexels, relative_reflectance
 from skindb.parameters import FitParameters
 from skindb.reflectance.dictionary import Dictionary
 from skindb.reflectance.kinds import unfitted_model
 from skindb.reflectance.model import FitRequest, ReflectanceModel
 from skindb.schema import dataset
-from skindb.schema.notes import Omission, explain
+from skindb.schema.notes import Omission
 from skindb.types import Mask
+
+RELATIVE = "no white target: R_d is relative to an unknown factor per channel"
 
 
 @dataclass(frozen=True)
@@ -27,10 +29,16 @@ class FitPlan:
     lights: Mask  # (light,) that reach one of them
     translucency: bool
     omissions: tuple[Omission, ...]
+    relative: bool  # R_d has an unknown factor per channel
+
+    def skipped(self) -> list[str]:
+        """One line per thing that is skipped or unknown."""
+        lines = [str(omission) for omission in self.omissions]
+        return [*lines, RELATIVE] if self.relative else lines
 
     def explain(self) -> list[str]:
-        """One line per thing that is skipped, for `--explain`."""
-        return explain(self.omissions)
+        """The lines of `skipped`, or one that says that there are none."""
+        return self.skipped() or ["nothing is skipped"]
 
 
 def plan_fit(
@@ -114,8 +122,10 @@ def plan_fit(
                 "translucency", 1, 1, "no probe measurement: the model has no sigma_tr"
             ),
         )
-    surface = surface_of(lumitexels(capture), parameters, dictionary)
-    return FitPlan(surfels, reached, probe, omissions + surface.omissions)
+    samples = lumitexels(capture)
+    omissions += surface_of(samples, parameters, dictionary).omissions
+    relative = relative_reflectance(samples)
+    return FitPlan(surfels, reached, probe, omissions, relative)
 
 
 def surface_of(

@@ -54,6 +54,7 @@ from skindb.format.scan_checks import (
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.geometry.scan import Crop, Scan, crop_faces, read_scan
 from skindb.limits import MAX_FRAMES, MAX_OBJECT_KEYS, MAX_REGIONS
+from skindb.parameters import SCAN_ERROR_DEGREES
 from skindb.schema.cohort import imitates_column
 from skindb.types import Float64, Index
 
@@ -61,6 +62,9 @@ Point = Float64  # (3,) mm
 FORMAT = "skindb-capture"
 VERSIONS = (1, 2)
 OVERRIDE = ("screened", "consented", "eyes_closed")  # what the operator confirms
+# degrees; larger ones than the maximum cannot be told apart
+MIN_SCAN_ERROR = 0.1
+MAX_SCAN_ERROR = 90.0
 SCOPES = ("fit", "statistics", "export", "publish")
 WHOLE_SURFACE = "all"  # name of the entire surface in reports by region
 SIMULATED = ("virtual", "seed", "rehearsal")  # attributes of virtual captures
@@ -80,6 +84,7 @@ class Capture:
     # name of the calibration in the database that applied; empty: the values of
     # dome.json
     calibration: str
+    scan_error: float  # RMS angle of the scan's normals to the true ones [degree]
     # confirmation of flashes above the limit for photosensitive seizures; may be empty
     override: Mapping[str, Any]
     mesh_file: Path
@@ -237,6 +242,11 @@ class _Reader:
         record["calibration"] = ""
         if self._has_in_version_2("calibration"):
             record["calibration"] = fields.text("calibration", rule=NAME)
+        record["scan_error"] = SCAN_ERROR_DEGREES
+        if self._has_in_version_2("scan_error"):
+            record["scan_error"] = fields.number(
+                "scan_error", minimum=MIN_SCAN_ERROR, maximum=MAX_SCAN_ERROR
+            )
         return record | {"override": self._override()}
 
     def frame_files(self) -> Iterator[Path]:

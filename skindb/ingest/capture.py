@@ -137,7 +137,7 @@ def ingest_capture(
     run.groups |= {"mesh": mesh_group(capture, surfels), "atlas": atlas_group(surfels)}
     with ExitStack() as stack:
         if capture.dome is None:
-            run.groups["surfels"] = surfel_group(surfels)
+            run.groups["surfels"] = surfel_group(surfels, scan_error=capture.scan_error)
         else:
             spool = stack.enter_context(run.spool(capture.dome, Path(scratch)))
             # ends before the spool does
@@ -384,7 +384,11 @@ class _DomeStages:
         dome = self.dome
         groups = {
             "surfels": surfel_group(
-                self.run.surfels, dome, check.light_visible, visible
+                self.run.surfels,
+                dome,
+                check.light_visible,
+                visible,
+                scan_error=self.run.capture.scan_error,
             ),
             "samples": sample_group(dome, lumitexels),
             "dome": dome_group(dome, check.intensity),

@@ -18,6 +18,7 @@ from skindb.ingest.consistency import Calibration
 from skindb.ingest.lumitexels import FULL_SHADOW, MIN_LIT_FRACTION, Lumitexels
 from skindb.ingest.probe_profiles import Profiles
 from skindb.ingest.surfels import SurfelSet, transferred_landmarks
+from skindb.parameters import SCAN_ERROR_DEGREES
 from skindb.schema import dataset
 from skindb.types import Float64
 
@@ -31,13 +32,18 @@ def surfel_group(
     dome: DomeRecord | None = None,
     light_fraction: NDArray[np.float16] | None = None,
     camera_fraction: NDArray[np.float16] | None = None,
+    *,
+    scan_error: float = SCAN_ERROR_DEGREES,
 ) -> xr.Dataset:
-    """Group "surfels"; without a dome it has no visibility."""
+    """Group "surfels", with the error of the scan's normals [degree]; without a dome it
+    has no visibility.
+    """
     variables: dict[str, Any] = {
         "surfel_position": surfels.position,
         "surfel_normal": surfels.normal,
         "surfel_area": surfels.area,
         "surfel_uv": surfels.uv,
+        "scan_normal_error": scan_error,
     }
     coords = dict[str, list[str]]()
     if surfels.region_names:

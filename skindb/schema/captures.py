@@ -69,6 +69,12 @@ SURFEL_NORMAL = declare(
     "unit normal of the scan, outwards",
     uses=Use.COPIED | Use.SURVIVES_EDIT,
 )
+SCAN_NORMAL_ERROR = declare(
+    "float64 surfels/scan_normal_error() [degree]",
+    "RMS angle of the scan's normals to the true ones, the prior of the normals; 3 where "
+    "it is absent, 60 or more without a scan",
+    uses=Use.COPIED | Use.SURVIVES_EDIT,
+)
 SURFEL_AREA = declare(
     "float32 surfels/surfel_area(surfel) [mm2]",
     "a third of the area of the adjacent triangles",
@@ -167,6 +173,11 @@ CAMERA_POLARISATION = declare(
     "the same of the light that a camera sees; handedness is that along the path of the "
     "light",
     "Ghosh et al. 2011",
+)
+RELATIVE_REFLECTANCE = declare(
+    "int8 dome/relative_reflectance() [1]",
+    "1 where neither a white target nor intensities are known: reflectance is relative to "
+    "an unknown factor per channel; 0 if absent",
 )
 CAMERA_POSITION = declare(
     "float32 dome/camera_position(camera, xyz) [mm]",

@@ -49,8 +49,3 @@ class Omission:
         )
         count = f"{self.skipped} of {self.of}" if self.of else "some"
         return f"{self.what}: {count} are skipped ({self.reason}); {cost}"
-
-
-def explain(omissions: tuple[Omission, ...]) -> list[str]:
-    """One line per thing that is skipped, for `--explain`."""
-    return [str(omission) for omission in omissions] or ["nothing is skipped"]

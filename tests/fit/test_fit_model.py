@@ -289,6 +289,52 @@ def test_without_even_reflection__changes_no_prediction_and_no_picture(fitted, p
     np.testing.assert_allclose(*pictures, rtol=1e-6)
 
 
+def _fit_with(capture, dictionary, group, **scalars):
+    """The fitted model of a capture with other scalars in a group."""
+    changed = capture.copy()
+    labelled = {name: label(name, value) for name, value in scalars.items()}
+    changed[group] = xr.DataTree(capture[group].to_dataset().assign(labelled))
+    parameters = replace(HELD_OUT, surface_energy="condition")
+    return fit_model(changed, parameters, dictionary=dictionary)
+
+
+def test_fit_model__relies_on_the_scan_as_far_as_its_stated_error(
+    planted, small_dictionary, skin
+):
+    """The normals of a scan that is turned by 20 degrees."""
+    turned = planted.copy()
+    surfels = planted["surfels"].to_dataset().copy(deep=True)
+    true = skin.normal
+    tilted = true + np.tan(np.deg2rad(20)) * np.cross(true, [1.0, 0.0, 0.0])
+    surfels["surfel_normal"].values[:] = tilted / np.linalg.norm(
+        tilted, axis=1, keepdims=True
+    )
+    turned["surfels"] = xr.DataTree(surfels)
+    angles = []
+    for error in (1e-3, 60.0):
+        model = _fit_with(turned, small_dictionary, "surfels", scan_normal_error=error)
+        fitted = model["fitted"].to_dataset()
+        assert fitted["scan_normal_error"] == error
+        cosine = (fitted["shading_normal"].values * true).sum(axis=1)
+        angles.append(np.nanmedian(np.degrees(np.arccos(np.clip(cosine, -1, 1)))))
+    assert angles[0] > 10
+    assert angles[1] < 2
+
+
+def test_fit_model__relative_reflectance_has_no_prior_of_the_energy(
+    planted, small_dictionary
+):
+    absolute, relative = (
+        _fit_with(planted, small_dictionary, "dome", relative_reflectance=flag)
+        for flag in (0, 1)
+    )
+    assert absolute["fitted/even_reflection"] > 0
+    assert relative["fitted/even_reflection"] == 0
+    line = "no white target: R_d is relative to an unknown factor per channel"
+    assert line in relative.attrs["skipped"]
+    assert line not in absolute.attrs["skipped"]
+
+
 def _averaged(dictionary, whole):
     from skindb.fit.lumitexels import disc_angle
     from skindb.reflectance.dictionary import disc_dictionary

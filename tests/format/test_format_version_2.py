@@ -78,6 +78,7 @@ def second(capture_folder):
         version=2,
         calibration="dome-a",
         override=OVERRIDE,
+        scan_error=12.5,
     )
     return capture_folder
 
@@ -86,6 +87,7 @@ def test_read_capture__version_2_says_more(second, tmp_path):
     with ingest_capture(read_capture(second), scratch=tmp_path / "scratch") as tree:
         assert tree.attrs["calibration"] == "dome-a"
         assert tree.attrs["override"] == OVERRIDE
+        assert tree["surfels/scan_normal_error"] == 12.5
         for group in ("probe", "sequence"):
             check(
                 tree[group].to_dataset(),
@@ -148,6 +150,7 @@ def test_read_capture__version_1_keeps_these_keys_as_they_are(second):
         None,
     )
     assert capture.attributes["override"] == "nobody"
+    assert capture.scan_error == 3.0
 
 
 @pytest.mark.slow
@@ -172,6 +175,8 @@ def test_read_capture__version_1_keeps_these_keys_as_they_are(second):
             "screened]: this key is required",
         ),
         ("capture.json", {"override": []}, "must be a JSON object"),
+        ("capture.json", {"scan_error": 0}, "scan_error]: must be at least 0.1"),
+        ("capture.json", {"scan_error": 91}, "scan_error]: must be at most 90"),
         ("dome/dome.json", {"sequence": []}, "must be a list of at least one object"),
         ("dome/dome.json", {"sequence": _steps()[1:]}, None),
         (
