@@ -27,7 +27,7 @@ from skindb.reflectance.dictionary import embedded_dictionary
 from skindb.reflectance.mixture import Mixture
 from skindb.schema import dataset
 
-MODES = ("linear", "perceptual", "paper")
+MODES = ("linear", "perceptual")
 SIZES = range(1, 9)
 LAYERS = ((6, 21), (21, 21), (21, 3))
 # BRDF (..., 3) sr^-1 of local directions
@@ -155,15 +155,11 @@ def _table(heads, rows):
 
 def print_modes(samples: dict[str, xr.Dataset]) -> dict[str, xr.Dataset]:
     """Print residuals of the full dictionary by mode; returns the perceptual fits."""
-    dictionary = embedded_dictionary()
-    models = {mode: Mixture.of_dictionary(dictionary, mode=mode) for mode in MODES}
+    surface = Mixture.of_dictionary(embedded_dictionary())
     rows = []
     perceptual = {}
     for name, ds in samples.items():
-        fits = {
-            mode: fit_surface(ds, surface=model, mode=mode)
-            for mode, model in models.items()
-        }
+        fits = {mode: fit_surface(ds, surface=surface, mode=mode) for mode in MODES}
         perceptual[name] = fits["perceptual"]
         rd = ds["diffuse_reflectance"].median("surfel").values
         cells = [

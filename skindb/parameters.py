@@ -63,7 +63,6 @@ DICTIONARY_HELP = (
     "Dictionary to use instead of the embedded one: a folder of MERL files, or an .npz "
     "file of tables."
 )
-FullMode = Literal["perceptual", "linear", "paper"]
 
 
 @dataclass(frozen=True)
@@ -200,8 +199,7 @@ class FitParameters(Limited):
     surface
         Surface model: a mixture of the BRDFs of a dictionary, or one GGX lobe.
     mode, rank
-        Mode and rank of the fit by the dictionary, see `fit_surface`. After "paper" the
-        refit uses "perceptual".
+        Mode and rank of the fit by the dictionary, see `fit_surface`.
     eta
         Refractive index of skin.
     surface_energy, surface_energy_error
@@ -234,9 +232,8 @@ class FitParameters(Limited):
     surface: Literal["mixture", "ggx"] = option(
         "mixture", "Surface model: mixture of measured BRDFs, or one GGX lobe."
     )
-    mode: FullMode = option(
-        "perceptual",
-        "Space of the least squares: cube-root space, linear, or that of the paper.",
+    mode: Literal["perceptual", "linear"] = option(
+        "perceptual", "Space of the least squares: cube-root space, or linear."
     )
     rank: int = option(
         16,

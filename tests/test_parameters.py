@@ -46,7 +46,7 @@ def test_parameters__every_fault_is_reported_at_once():
         FitParameters(k=0, mode="loud", eta=float("nan"), hold_out_lights=1.5, seed=-1)
     assert [str(fault) for fault in caught.value.faults] == [
         "k: must be at least 1; found 0; give another value",
-        "mode: must be one of perceptual, linear, paper; found 'loud'; give another value",
+        "mode: must be one of perceptual, linear; found 'loud'; give another value",
         "eta: must lie in [1, 2]; found nan; give another value",
         "hold_out_lights: must lie in [0, 0.9]; found 1.5; give another value",
         "seed: must be at least 0; found -1; give another value",

@@ -208,16 +208,6 @@ def _mixed(samples: Strip, weight: Array) -> Predict:
     return lambda part, s: np.asarray(samples.rows[part] @ weight[s])
 
 
-def _cubed(samples: Strip, roots: Array, weight: Array) -> Predict:
-    """Prediction of the paper's weights: cos(theta_i) times the cube of the mixed cube roots."""
-
-    def predict(part: slice, s: int) -> Array:
-        mixed = samples.looked_up(roots, part) @ weight[s]
-        return np.asarray(mixed**3 * samples.cosine[part])
-
-    return predict
-
-
 def _both_spaces(
     kernel: str,
     reference: str,
@@ -260,30 +250,20 @@ def surface_curves(quick: bool) -> list[Curve]:
             seconds, weight = cpu_time(work, few)
             point = Point(f"SciPy nnls, {rows}, {name}", "", seconds, np.nan)
             results.append((point, _errors(samples, few, _mixed(samples, weight))))
-    for mode in ("linear", "perceptual", "paper"):
-        table = np.cbrt(dictionary.table) if mode == "paper" else dictionary.table
+    for mode in ("linear", "perceptual"):
         for rank in (16, 59) if quick else (8, 12, 16, 24, 59):
+            table = dictionary.table
             model = Mixture(*reduce_dictionary(table, rank, exact=dictionary.exact))
             seconds, fit = _fit(samples, model, mode)
             details = {
                 "kkt": float(fit.kkt.max()),
                 "not_fitted": float((fit.status != 0).sum()),
             }
-            setting = f"rank {rank}"
+            point = Point(
+                f"skindb {mode}", f"rank {rank}", seconds, np.nan, "", details
+            )
             mixed = _mixed(samples, fit.parameters)
-            predict = mixed
-            if mode == "paper":
-                predict = _cubed(samples, table, fit.parameters)
-            point = Point(f"skindb {mode}", setting, seconds, np.nan, "", details)
-            results.append((point, _errors(samples, few, predict)))
-            if mode == "paper" and rank == 59:
-                failure = (
-                    "cbrt(M x) is not cbrt(M) x, so weights of cube roots do not mix "
-                    "reflectance"
-                )
-                name = "paper's weights used as linear weights"
-                point = Point(name, setting, seconds, np.nan, failure, details)
-                results.append((point, _errors(samples, few, mixed)))
+            results.append((point, _errors(samples, few, mixed)))
     return _both_spaces("surface", TRUTH, SCIPY, results)
 
 

@@ -66,7 +66,7 @@ def compile_step(step: str) -> None:
             separate_diffuse(block, np.zeros((0, 2)), eta=1.3)
         case "mixture" | "ggx":
             kind = Mixture if step == "mixture" else GGX
-            model = kind.unfitted(FitRequest(1.3, 0.0, "perceptual", 16, 4))
+            model = kind.unfitted(FitRequest(1.3, 0.0, 16, 4))
             model.fit(block, comparison)
             model.judge(block, comparison, judgement)
         case "normals":

@@ -246,8 +246,7 @@ def second_pass(
             samples.merge(fitted[list(ESTIMATES)]),
             held_out=held_out,
             basis=basis,
-            # only mixtures of BRDFs can be rendered
-            mode="perceptual" if parameters.mode == "paper" else parameters.mode,
+            mode=parameters.mode,
             eta=parameters.eta,
         )
     groups = _groups(capture, fitted.assign(judged), basis, gains)

@@ -141,7 +141,6 @@ def surface_of(
     request = FitRequest(
         parameters.eta,
         disc_angle(lumitexels),
-        parameters.mode,
         parameters.rank,
         parameters.k,
         dictionary,

@@ -61,9 +61,8 @@ def fit_surface(
         Surface model, such as `Mixture.of_dictionary`: mixtures of all BRDFs of a
         dictionary.
     mode
-        "perceptual" (in cube-root space), "linear" (see
-        `skindb.reflectance.mixture.fit_reflectance`), or "paper": cube roots of the elements
-        are mixed, and the prediction is the cube of the mixture.
+        "perceptual" (in cube-root space) or "linear", see
+        `skindb.reflectance.mixture.fit_reflectance`.
     eta
         Refractive index of the diffuse term that is subtracted.
     min_width
@@ -123,7 +122,7 @@ def refit(
     basis
         Group "basis" of a model, such as `basis_brdf` of k components from `reduce_basis`.
     mode, eta, min_width
-        As in `fit_surface`; not "paper", whose mixtures are not BRDFs that could be reduced.
+        As in `fit_surface`.
 
     Returns
     -------

@@ -17,7 +17,6 @@ from skindb.reflectance._lumitexel_kernels import (
     FEW,
     FITTED,
     OUTLIER_SPREAD,
-    PAPER,
     PERCEPTUAL,
     JudgedErrors,
     Lumitexel,
@@ -32,7 +31,6 @@ from skindb.reflectance._lumitexel_kernels import (
     relative_drift,
     smallest_half_angle,
     split_diffuse,
-    surface_factor,
     weigh,
     weigh_outliers,
     write_rows,
@@ -59,20 +57,6 @@ class Tables(NamedTuple):
     table: Tensor32  # (nh, nd, np, width) padded with zeros
     lift: Matrix  # (r, m) from the space of the tables; square: the identity
     half_width: Vector  # (m,) at half maximum, as an angle of the half vector [rad]
-
-
-@kernel
-def _cube_roots(count: int, b: Lumitexel) -> None:
-    """Convert rows and targets for mode "paper": the table holds cube roots, so that
-    only the cosine is converted.
-    """
-    for r in range(count):
-        cosine = b.lit[b.pairs[r, 0]] * surface_factor(r, b)
-        scale = np.float32(cosine ** (-2.0 / 3.0))
-        for q in range(b.rows.shape[1]):
-            b.rows[r, q] *= scale
-        for c in range(3):
-            b.target[c, r] = np.cbrt(b.target[c, r])
 
 
 @kernel
@@ -126,8 +110,6 @@ def fit_block(block: Block, tables: Tables, options: Options, out: SurfaceFit) -
             continue
         split_diffuse(block.diffuse[s], count, b)
         weigh(s, count, block.noise, options, b)
-        if options.mode == PAPER:
-            _cube_roots(count, b)
         x = out.parameters[s]
         if options.solve:
             _block_narrow(tables.half_width, options.min_width * seen, work)
@@ -143,9 +125,6 @@ def fit_block(block: Block, tables: Tables, options: Options, out: SurfaceFit) -
                 out.iterations[s] += more
             out.status[s] = fitted_status(converged, block.diffuse[s])
         predict(b.rows, count, coefficients(lift, x), b.surface, work.single)
-        if options.mode == PAPER:
-            for r in range(count):
-                b.surface[r] = b.surface[r] ** 3
         out.residual[s], out.residual_perceptual[s] = add_surface(count, b)
 
 

@@ -58,7 +58,7 @@ MIN_COSINE_OUTLIER = 0.2
 # factor of the surface term behind the best polarisers; cube roots need a positive one
 MIN_GLOSS = 1e-4
 NO_FLOOR = 1e-9  # sr^-1; floor of the cube roots for residuals
-LINEAR, PERCEPTUAL, PAPER = range(3)
+LINEAR, PERCEPTUAL = range(2)
 # scales of the residuals of the surfel: exceeded by normal noise once in two million,
 # and by 1.1 to 2.6 % of samples of six clean captures of another renderer (partly
 # hidden lights, lobes outside the basis); with 4 scales twice as many would be
@@ -466,7 +466,7 @@ def weigh(
     The noise is that of the diffuse part, as weights by the noisy samples would favour
     some of them.
     """
-    if options.mode == PAPER or not write_noise(surfel, count, noise, b):
+    if not write_noise(surfel, count, noise, b):
         for r in range(count):
             b.weight[r] = 1.0
         return

@@ -25,7 +25,7 @@ from skindb.reflectance.tables import Table
 from skindb.schema import variables
 from skindb.types import Array
 
-MODES = ("linear", "perceptual", "paper")  # in the order of `_lumitexel_kernels`
+MODES = ("linear", "perceptual")  # in the order of `_lumitexel_kernels`
 # that any model has after a first pass, in the order of `SurfaceFit` after its parameters
 FIT_VARIABLES = (
     variables.KKT_RESIDUAL,

@@ -93,11 +93,7 @@ class GGX:
 
     @classmethod
     def unfitted(cls, request: FitRequest) -> GGX:
-        """The model before a fit; there is none in the mode "paper" or of a dictionary."""
-        if request.mode == "paper":
-            rule = 'the surface "ggx" is fitted in the mode "perceptual" or "linear"'
-            cure = "choose another mode"
-            raise InputError(Fault("mode", rule, request.mode, cure))
+        """The model before a fit; there is none of a dictionary."""
         if request.dictionary is not None:
             rule = "mixtures alone are of a dictionary"
             cure = "omit it, or fit a mixture"

@@ -71,8 +71,7 @@ Mode = Literal["linear", "perceptual"]
 class Mixture:
     """Non-negative mixtures of m BRDF tables, whose weights are the parameters.
 
-    The tables may be reduced to a space of r dimensions. For mode "paper" they hold the
-    cube roots of the BRDFs.
+    The tables may be reduced to a space of r dimensions.
     """
 
     BASIS_VARIABLE: ClassVar[str] = variables.BASIS_BRDF
@@ -83,7 +82,6 @@ class Mixture:
     names: tuple[str, ...] = ()  # of the m components
     # of which the weights are, if of all its BRDFs
     dictionary: Dictionary | None = None
-    roots: bool = False  # whether the tables are cube roots
     # `table` over `scale`, padded to full vectors
     filled: Table = field(init=False, repr=False)
     matrix: Float64 = field(init=False, repr=False)  # `lift` for the kernels
@@ -115,14 +113,11 @@ class Mixture:
             object.__setattr__(self, "names", names)
 
     @classmethod
-    def of_dictionary(
-        cls, dictionary: Dictionary, *, rank: int = 16, mode: str = "perceptual"
-    ) -> Mixture:
+    def of_dictionary(cls, dictionary: Dictionary, *, rank: int = 16) -> Mixture:
         """Mixtures of all BRDFs of a dictionary, by their `rank` most important dimensions."""
-        roots = mode == "paper"
-        reduced, lift = reduced_dictionary(dictionary, rank, cube_roots=roots)
+        reduced, lift = reduced_dictionary(dictionary, rank)
         disc = dictionary.disc_angular_radius
-        return cls(reduced, lift, disc, dictionary.names, dictionary, roots)
+        return cls(reduced, lift, disc, dictionary.names, dictionary)
 
     @classmethod
     def unfitted(cls, request: FitRequest) -> Mixture:
@@ -132,7 +127,7 @@ class Mixture:
         if request.k > count:  # checked before the fit
             rule = f"a reduced basis of this dictionary has 1 to {count} components"
             raise InputError(Fault("k", rule, str(request.k), "choose a smaller k"))
-        return cls.of_dictionary(tables, rank=request.rank, mode=request.mode)
+        return cls.of_dictionary(tables, rank=request.rank)
 
     @classmethod
     def of_basis(cls, basis: xr.Dataset) -> Mixture:
@@ -205,8 +200,7 @@ class Mixture:
         if space >= count:
             return ()
         rank = space - self.dictionary.exact
-        bound = rank_truncation(self.dictionary, rank, self.roots)
-        subject = "cube roots of mixtures" if self.roots else "mixtures"
+        bound = rank_truncation(self.dictionary, rank)
         omission = Omission(
             "dimensions of the dictionary",
             count - space,
@@ -214,7 +208,7 @@ class Mixture:
             f"rank {rank}; at a single pair of directions up to {bound.worst:.3g} "
             "times the value",
             bound.rms,
-            f"{subject}, RMS over directions,",
+            "mixtures, RMS over directions,",
         )
         return (omission,)
 
@@ -257,8 +251,8 @@ class Mixture:
         judgement: Judgement,
         parameters: Array | None = None,
     ) -> JudgedFit:
-        """Weights of n surfels with their errors, held-out samples and outliers; not in
-        mode "paper", and only for tables that are not reduced.
+        """Weights of n surfels with their errors, held-out samples and outliers;
+        only for tables that are not reduced.
         """
         count = self.matrix.shape[1]
         errors, out = empty_judgement(block, judgement, count, self._scaled(parameters))

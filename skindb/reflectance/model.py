@@ -61,7 +61,7 @@ class Block(NamedTuple):
 class Comparison(NamedTuple):
     """How samples are compared with a prediction, and which are used."""
 
-    mode: str = "perceptual"  # or "linear", or "paper"
+    mode: str = "perceptual"  # or "linear"
     eta: float = 1.3  # refractive index of the diffuse term
     noise_floor: float = 1.0  # sr^-1; samples below it are compared linearly
     min_samples: int = 1  # per surfel
@@ -145,7 +145,6 @@ class FitRequest(NamedTuple):
 
     eta: float  # refractive index of skin
     disc_angular_radius: float  # of the lights as seen from the surfels [rad]
-    mode: str  # see `Comparison`
     rank: int  # of the reduced dictionary
     k: int  # components that the model is reduced to after the first pass
     dictionary: Dictionary | None = None  # for point lights; default the embedded one

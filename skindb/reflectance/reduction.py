@@ -130,21 +130,20 @@ def _cell_weight(mean: Array, grid: TableGrid) -> Array:
 
 
 @lru_cache(maxsize=2)
-def reduced_dictionary(
-    dictionary: Dictionary, rank: int, *, cube_roots: bool = False
-) -> tuple[Table, Array]:
-    """`reduce_dictionary` of the tables or of their cube roots; cached for the takes of a dome."""
+def reduced_dictionary(dictionary: Dictionary, rank: int) -> tuple[Table, Array]:
+    """`reduce_dictionary` of the tables; cached for the takes of a dome."""
 
     def make() -> dict[str, NDArray[Any]]:
-        table = np.cbrt(dictionary.table) if cube_roots else dictionary.table
-        reduced, lift = reduce_dictionary(table, rank, exact=dictionary.exact)
+        reduced, lift = reduce_dictionary(
+            dictionary.table, rank, exact=dictionary.exact
+        )
         return {"reduced": reduced, "lift": lift}
 
     # without a reduction, the result is not worth the space in the cache
     if rank >= len(dictionary.names) - dictionary.exact:
         arrays = make()
         return arrays["reduced"], arrays["lift"]
-    arguments = (dictionary.digest, rank, cube_roots)
+    arguments = (dictionary.digest, rank)
     cached = cached_arrays("reduced-dictionary", arguments, sources=SOURCES, make=make)
     return cached["reduced"], cached["lift"]
 
@@ -204,18 +203,16 @@ def truncation_bound(
 
 
 @lru_cache(maxsize=4)
-def rank_truncation(dictionary: Dictionary, rank: int, cube_roots: bool) -> Truncation:
+def rank_truncation(dictionary: Dictionary, rank: int) -> Truncation:
     """`truncation_bound` of `reduced_dictionary`; cached for the takes of a dome."""
 
     def make() -> dict[str, NDArray[Any]]:
-        table = np.cbrt(dictionary.table) if cube_roots else dictionary.table
-        bound = truncation_bound(
-            table, *reduced_dictionary(dictionary, rank, cube_roots=cube_roots)
-        )
+        reduced = reduced_dictionary(dictionary, rank)
+        bound = truncation_bound(dictionary.table, *reduced)
         return {"rms": np.array(bound.rms), "worst": np.array(bound.worst)}
 
     cached = cached_arrays(
-        "truncation", (dictionary.digest, rank, cube_roots), sources=SOURCES, make=make
+        "truncation", (dictionary.digest, rank), sources=SOURCES, make=make
     )
     return Truncation(float(cached["rms"]), float(cached["worst"]))
 

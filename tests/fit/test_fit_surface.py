@@ -7,11 +7,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
-from scipy.optimize import nnls
 
 from skindb.errors import InputError
 from skindb.fit import fit_surface, held_out_error, reduce_basis, refit
-from skindb.fit.surface import NEEDED, NOISE_FLOOR_SURFACE
+from skindb.fit.surface import NOISE_FLOOR_SURFACE
 from skindb.optics.angles import half_difference
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance._lumitexel_kernels import MIN_COSINE_SURFACE
@@ -49,7 +48,7 @@ def test_fit_surface__reproduces_planted_reflectance(
     found = fit_surface(
         lumitexels,
         min_width=0.0,
-        surface=Mixture.of_dictionary(small_dictionary, rank=rank, mode=mode),
+        surface=Mixture.of_dictionary(small_dictionary, rank=rank),
         mode=mode,
     )
     assert (found["fit_status"] == FitStatus.FITTED).all()
@@ -87,7 +86,7 @@ def test_fit_surface__reduced_rank_agrees_within_the_bound(
         fit_surface(
             lumitexels,
             min_width=0.0,
-            surface=Mixture.of_dictionary(small_dictionary, rank=r, mode=mode),
+            surface=Mixture.of_dictionary(small_dictionary, rank=r),
             mode=mode,
         )
         for r in (6, rank)
@@ -456,55 +455,6 @@ def test_brdf_metric__is_the_sum_over_cells(small_dictionary):
     np.testing.assert_allclose(
         brdf_metric(small_dictionary.table)[1, 4], total, rtol=1e-5
     )
-
-
-def test_fit_surface__paper_rule_against_scipy(planted, small_dictionary):
-    """Cube roots of the elements of M and R, their weights by SciPy, reflectance as the
-    cube of the mixture.
-    """
-    lumitexels, _ = planted
-    found = fit_surface(
-        lumitexels.isel(surfel=slice(0, 4)),
-        min_width=0.0,
-        surface=Mixture.of_dictionary(small_dictionary, rank=6, mode="paper"),
-        mode="paper",
-    )
-    sample, position, light, camera, normal, diffuse = (
-        lumitexels[name].values.astype(float) for name in NEEDED
-    )
-    for s in range(4):
-        wi, wo = (
-            (d - position[s]) / np.linalg.norm(d - position[s], axis=-1, keepdims=True)
-            for d in (light, camera)
-        )
-        ci = wi @ normal[s]
-        co = wo @ normal[s]
-        i, o = np.nonzero(
-            np.isfinite(sample[s]).all(-1) & (ci > 0.1)[:, None] & (co > 0.1)
-        )
-        table = lookup(
-            np.cbrt(small_dictionary.table), *half_difference(wi[i], wo[o], normal[s])
-        )
-        M = table * np.cbrt(ci[i])[:, None]
-        f = (
-            ci[i]
-            * fresnel_transmittance(ci[i], 1.3)
-            * fresnel_transmittance(co[o], 1.3)
-            / np.pi
-        )
-        given = sample[s, i, o]
-        scattered = f[:, None] * diffuse[s]
-        x, _ = nnls(np.repeat(M, 3, axis=0), np.cbrt(given - scattered).ravel())
-        # places in the table are single precision, and weights of like columns trade:
-        # the fits are compared
-        root = np.cbrt(given - scattered)
-        ours = found["dictionary_weight"].values[s]
-        here, there = (np.linalg.norm(root - (M @ w)[:, None]) for w in (x, ours))
-        assert there < here * (1 + 1e-3)
-        error = np.linalg.norm(
-            (M @ x)[:, None] ** 3 + scattered - given
-        ) / np.linalg.norm(given)
-        assert float(found["dictionary_residual"][s]) == pytest.approx(error, rel=0.05)
 
 
 def test_fit_surface__counts_and_condition(planted, small_dictionary):

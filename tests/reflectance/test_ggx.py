@@ -344,11 +344,9 @@ def test_kinds__are_the_choices_of_fits():
 
 
 def test_kinds__stored_and_unfitted_models():
-    model = unfitted_model("ggx", FitRequest(1.4, 0.01, "linear", 16, 4))
+    model = unfitted_model("ggx", FitRequest(1.4, 0.01, 16, 4))
     assert model == GGX(1.4, 0.01)
     stored = dataset({"lobe_index": 1.4, "disc_angular_radius": 0.01})
     assert surface_model(stored) == model
-    with pytest.raises(InputError, match="perceptual"):
-        unfitted_model("ggx", FitRequest(1.4, 0.01, "paper", 16, 4))
     with pytest.raises(InputError, match="mixtures alone are of a dictionary"):
-        unfitted_model("ggx", FitRequest(1.4, 0.01, "linear", 16, 4, object()))
+        unfitted_model("ggx", FitRequest(1.4, 0.01, 16, 4, object()))
