@@ -162,7 +162,7 @@ def normals_curves(quick: bool) -> list[Curve]:
             error_of="median angle [degree]",
             reference=f"true normals of samples of the model, {NOISE:.0%} noise",
             seconds_of="a surfel",
-            base=f"peak, {domes[-1][0]}",
+            base=f"combined, {domes[-1][0]}",
             points=points,
         )
     ]

@@ -19,7 +19,7 @@ from skindb.optics._photometric_kernels import (
 )
 from skindb.types import Matrix, Vector
 
-COMBINED, CHROMATIC, PHOTOMETRIC, PEAK = range(4)
+COMBINED, CHROMATIC, PHOTOMETRIC = range(3)
 # Terms of the total error that cover 91 to 96 % of the normals of six independent
 # captures with known truth: shadows, folds and residual highlights affect neighbouring
 # lights alike, which increases the angle between the two estimates the second in
@@ -109,9 +109,7 @@ def _choose(
 ) -> None:
     """Write the normal of a method."""
     for k in range(3):
-        if method == PEAK:
-            out[k] = estimates.peak[k]
-        elif method == COMBINED:
+        if method == COMBINED:
             out[k] = combined[k]
         else:
             out[k] = estimates.normal[0 if method == PHOTOMETRIC else 1, k]
@@ -141,12 +139,10 @@ def normals_block(
     eta: float,
     scan_error: float,
     chosen: Matrix,
-    disagreement: Vector,
     error: Vector,
     total: Vector,
 ) -> None:
-    """Normals (n, 3) by the method, angle (n,) of peak and combined, standard and total
-    error (n,) [degree].
+    """Normals (n, 3) by the method, standard and total error (n,) [degree].
 
     `scan_error` is an angle [rad].
     """
@@ -173,10 +169,9 @@ def normals_block(
         elif method == CHROMATIC:
             share = 0.0
         _choose(method, estimates, combined, chosen[s])
-        disagreement[s] = _angle(estimates.peak, combined)
         error[s] = math.nan
         total[s] = math.nan
-        if method != PEAK and np.isfinite(chosen[s]).all():
+        if np.isfinite(chosen[s]).all():
             error[s] = math.degrees(math.sqrt(_variance(share, estimates, scan_error)))
             if method == COMBINED:
                 total[s] = _total_error(error[s], estimates)

@@ -14,7 +14,7 @@ from skindb.schema import check
 from skindb.types import Array
 
 # in the order of the codes in `_normal_kernels`
-METHODS = ("combined", "chromatic", "photometric", "peak")
+METHODS = ("combined", "chromatic", "photometric")
 
 
 def estimate_normals(
@@ -31,7 +31,7 @@ def estimate_normals(
     lumitexels
         Samples with geometry, from `lumitexels`.
     method
-        "peak": the paper's rule. "photometric": robust photometric stereo on a low
+        "photometric": robust photometric stereo on a low
         quantile over cameras of the mean channel. "chromatic": the same on the colour
         difference of the channels, which white highlights do not have. "combined": mean
         of the last two by inverse variance; the most exact on captures with known
@@ -39,16 +39,14 @@ def estimate_normals(
     eta
         Refractive index of the Fresnel factors.
     scan_error
-        RMS angle of the scan's normals to the true ones [degree], the prior of all but
-        "peak"; a large value switches it off.
+        RMS angle of the scan's normals to the true ones [degree], a prior; a large
+        value switches it off.
 
     Returns
     -------
     Dataset
-        `shading_normal` (NaN without samples) and `normal_disagreement` [degree], the
-        angle between "peak" and "combined": large where the surface has no highlight,
-        or where one of the two fails; `normal_error` [degree], the RMS angle due to the
-        noise of the samples and the error of the scan (NaN for "peak"): 95 to 97 % of
+        `shading_normal` (NaN without samples); `normal_error` [degree], the RMS angle due
+        to the noise of the samples and the error of the scan: 95 to 97 % of
         the angles lie below 1.73 times it on matte skin, 88 to 95 % on glossy skin,
         where residual highlights rotate normals without visible residuals; and
         `normal_total_error` [degree] ("combined" alone), three times that, the angle
@@ -68,12 +66,7 @@ def estimate_normals(
         lumitexels,
         over="surfel",
         inputs=(*GEOMETRY, "surfel_normal"),
-        outputs=(
-            "shading_normal",
-            "normal_disagreement",
-            "normal_error",
-            "normal_total_error",
-        ),
+        outputs=("shading_normal", "normal_error", "normal_total_error"),
         method=method,
         eta=eta,
         scan_error=scan_error,
@@ -90,13 +83,10 @@ def surfel_normals(
     method: str,
     eta: float,
     scan_error: float,
-) -> tuple[Array, Array, Array, Array]:
-    """(n, 3) normals by `method`, angle (n,) of peak and combined, standard and total
-    error (n,) [degree].
-    """
+) -> tuple[Array, Array, Array]:
+    """(n, 3) normals by `method`, standard and total error (n,) [degree]."""
     n = len(position)
     chosen = np.empty((n, 3))
-    disagreement = np.empty(n)
     error = np.empty(n)
     total = np.empty(n)
     position, light, camera, scan = (
@@ -112,8 +102,7 @@ def surfel_normals(
         float(eta),
         float(np.deg2rad(scan_error)),
         chosen,
-        disagreement,
         error,
         total,
     )
-    return chosen, disagreement, error, total
+    return chosen, error, total

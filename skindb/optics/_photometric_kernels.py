@@ -26,7 +26,6 @@ from skindb.jit import (
 from skindb.types import (
     Cube,
     Cube32,
-    IntMatrix32,
     IntVector,
     IntVector32,
     Matrix,
@@ -50,9 +49,6 @@ MAX_ITERATIONS = 12
 # squared change of the normal that ends the iteration: 0.002 degrees, a hundredth of
 # the smallest error
 MIN_SQUARED_CHANGE = 1e-9
-# lights that determine a camera's direction of maximum reflectance; the last one is the
-# base level
-BRIGHTEST = 5
 ZERO = np.float32(0)
 ONE = np.float32(1)
 HALF = np.float32(0.5)
@@ -61,12 +57,7 @@ HALF = np.float32(0.5)
 class NormalEstimates(NamedTuple):
     """Estimates for a surfel; NaN where the samples do not determine them.
 
-    `peak` follows the paper: the normal is half way between each camera and its
-    direction of maximum reflectance. It uses the darkest channel, which has the least
-    diffuse light under the highlight. The four brightest lights are weighted by their
-    excess over the fifth, cameras by the contrast of their brightest light.
-
-    The others are from robust photometric stereo of two signals. The first signal is a
+    They are from robust photometric stereo of two signals. The first signal is a
     low quantile over cameras of the mean channel, below the highlights; the second is
     the median of the colour difference that is zero for white light (Zickler et al.
     2008). The spread is the residual over the signal. The covariance describes the noise
@@ -74,7 +65,6 @@ class NormalEstimates(NamedTuple):
     rotates an estimate by `pull` t.
     """
 
-    peak: Vector  # (3,)
     normal: Matrix  # (2, 3)
     spread: Vector  # (2,)
     covariance: Cube  # (2, 3, 3) [rad^2]
@@ -87,13 +77,10 @@ class Buffers(NamedTuple):
 
     values: Vector32  # (lights cameras 3,) samples
     light: Matrix32  # (3, lights) unit directions, one row per axis
-    camera: Matrix  # (3, cameras)
     through: Vector32  # (cameras,) F_t towards the camera, 0 for unused cameras
     cameras: IntVector  # (cameras,) indices of the cameras that are used
     white: Matrix32  # (cameras, lights) mean channel over F_t, inf without a sample
     tinted: Matrix32  # (cameras, lights) the part along the skin's colour
-    # (cameras, lights) darkest channel, not below 0, inf where there is no sample
-    dark: Matrix32
     samples: IntVector  # (lights,) number of samples
     shade: Matrix32  # (2, lights) signals that the normal explains
     present: Vector32  # (lights,) 1 where there is a signal, else 0
@@ -102,21 +89,14 @@ class Buffers(NamedTuple):
     residual: Vector32  # (lights,)
     size: Vector32  # (lights,) absolute values of the residuals
     size_bits: IntVector32  # the same memory as int32
-    dark_bits: IntMatrix32
     score: Matrix  # (2, lights)
     turn: Cube  # (2, 3, 3) from a sum of score times direction to a rotation
-    half: Matrix  # (cameras, 3) half vectors of the brightest lights
-    contrast: Vector  # (cameras,) weights of these half vectors
-    trust: Vector  # (cameras,) the same without outliers
-    angle: Vector  # (cameras,)
-    ordered: Vector  # (cameras,)
 
 
 @kernel
 def normal_estimates() -> NormalEstimates:
     """Memory for the result of `estimate_normal`."""
     return NormalEstimates(
-        np.empty(3),
         np.empty((2, 3)),
         np.empty(2),
         np.empty((2, 3, 3)),
@@ -128,18 +108,15 @@ def normal_estimates() -> NormalEstimates:
 @kernel
 def buffers(lights: int, cameras: int) -> Buffers:
     """Memory for `estimate_normal`."""
-    single = np.zeros((10 + 3 * cameras, lights), np.float32)
-    dark = single[10 + 2 * cameras :]
+    single = np.zeros((10 + 2 * cameras, lights), np.float32)
     size = single[9]
     return Buffers(
         np.empty(lights * cameras * 3, np.float32),
         single[0:3],
-        np.zeros((3, cameras)),
         np.zeros(cameras, np.float32),
         np.zeros(cameras, np.int64),
         single[10 : 10 + cameras],
-        single[10 + cameras : 10 + 2 * cameras],
-        dark,
+        single[10 + cameras :],
         np.zeros(lights, np.int64),
         single[3:5],
         single[5],
@@ -148,14 +125,8 @@ def buffers(lights: int, cameras: int) -> Buffers:
         single[8],
         size,
         size.view(np.int32),
-        dark.view(np.int32),
         np.zeros((2, lights)),
         np.empty((2, 3, 3)),
-        np.empty((cameras, 3)),
-        np.empty(cameras),
-        np.empty(cameras),
-        np.empty(cameras),
-        np.empty(cameras),
     )
 
 
@@ -179,15 +150,6 @@ def _transmittance(cosine: Real, square: Real) -> Real:
     q = cosine * plus - ONE
     # a single division, as divisions dominate the time
     return ONE - HALF * minus * minus * (p * p + q * q) / (plus * plus * p * p)
-
-
-@fast_kernel
-def _unit(v: Vector) -> bool:
-    """Scale v to length 1; a vector of length 0 becomes NaN and returns False."""
-    size = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-    for k in range(3):
-        v[k] = v[k] / size if size > 0.0 else np.nan
-    return bool(size > 0.0)
 
 
 @fast_kernel
@@ -216,9 +178,6 @@ def _point(
         y = camera[o, 1] - position[1]
         z = camera[o, 2] - position[2]
         scale = 1.0 / math.sqrt(x * x + y * y + z * z)
-        b.camera[0, o] = x * scale
-        b.camera[1, o] = y * scale
-        b.camera[2, o] = z * scale
         cosine = np.float32((scan[0] * x + scan[1] * y + scan[2] * z) * scale)
         b.through[o] = ZERO
         if cosine > MIN_COSINE_CAMERA:
@@ -280,7 +239,6 @@ def _shades(n_cameras: int, cameras: int, b: Buffers) -> None:
             tint = (r * along_red + g * along_green + v * along_blue) * inverse
             b.white[q, i] = (r + g + v) * third if valid else missing
             b.tinted[q, i] = tint if valid else missing
-            b.dark[q, i] = max(min(r, g, v), ZERO) if valid else missing
     sort_columns(b.white, n_cameras, lights)
     sort_columns(b.tinted, n_cameras, lights)
     for i in range(lights):
@@ -555,100 +513,6 @@ def _covariance(
 
 
 @fast_kernel
-def _brightest(dark: Vector32, best: Vector, place: IntVector) -> None:
-    """The BRIGHTEST largest values and their indices, in descending order."""
-    for q in range(BRIGHTEST):
-        best[q] = -1.0
-        place[q] = 0
-    smallest = np.float32(-1)
-    for i in range(dark.shape[0]):
-        value = dark[i]
-        if value > smallest and value < np.inf:
-            q = BRIGHTEST - 1
-            while q > 0 and value > best[q - 1]:
-                best[q] = best[q - 1]
-                place[q] = place[q - 1]
-                q -= 1
-            best[q] = value
-            place[q] = i
-            smallest = np.float32(best[BRIGHTEST - 1])
-
-
-@fast_kernel
-def _peak(n_cameras: int, b: Buffers) -> None:
-    """Half vectors of the brightest lights of each camera and their weights; see
-    `NormalEstimates.peak`.
-    """
-    best = np.empty(BRIGHTEST)
-    place = np.empty(BRIGHTEST, np.int64)
-    maximum = np.empty(3)
-    for q in range(n_cameras):
-        b.half[q] = 0.0
-        b.contrast[q] = 0.0
-        _brightest(b.dark[q], best, place)
-        if best[BRIGHTEST - 1] < 0.0:
-            continue
-        lights = b.dark.shape[1]
-        count = 0
-        for i in range(lights):
-            count += int(b.dark[q, i] < np.inf)
-        maximum[:] = 0.0
-        for p in range(BRIGHTEST - 1):
-            for k in range(3):
-                maximum[k] += (best[p] - best[BRIGHTEST - 1]) * b.light[k, place[p]]
-        if best[0] > 0.0:  # relative to the brightest, so independent of the exposure
-            middle = median_of(b.dark[q], b.dark_bits[q], lights, count)
-            b.contrast[q] = max(best[0] / max(middle, 1e-6 * best[0]) - 1.0, 0.0)
-        if _unit(maximum):
-            for k in range(3):
-                b.half[q, k] = maximum[k] + b.camera[k, b.cameras[q]]
-            if not _unit(b.half[q]):
-                b.half[q] = 0.0
-
-
-@fast_kernel
-def _middle(values: Vector, count: int) -> float:
-    """Median of the first `count` values, which are sorted in place; 0 if there are none."""
-    for i in range(1, count):  # insertion sort, as there are few values
-        value = values[i]
-        j = i
-        while j > 0 and values[j - 1] > value:
-            values[j] = values[j - 1]
-            j -= 1
-        values[j] = value
-    return 0.5 * (values[(count - 1) // 2] + values[count // 2]) if count > 0 else 0.0
-
-
-@fast_kernel
-def _robust_mean(n_cameras: int, mean: Vector, b: Buffers) -> None:
-    """Mean direction of the half vectors without outliers, each weighted by the inverse
-    of its angle to the mean.
-    """
-    for q in range(n_cameras):
-        b.trust[q] = b.contrast[q]
-    for step in range(9):
-        mean[:] = 0.0
-        for q in range(n_cameras):
-            for k in range(3):
-                mean[k] += b.trust[q] * b.half[q, k]
-        if not _unit(mean) or step == 8:
-            return
-        count = 0
-        for q in range(n_cameras):
-            cosine = (
-                b.half[q, 0] * mean[0] + b.half[q, 1] * mean[1] + b.half[q, 2] * mean[2]
-            )
-            b.angle[q] = math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
-            if b.contrast[q] > 0.0:
-                b.ordered[count] = b.angle[q]
-                count += 1
-        limit = 2.5 * max(1.4826 * _middle(b.ordered, count), 2.0)
-        for q in range(n_cameras):
-            trust = b.contrast[q] / max(b.angle[q], 1.0)
-            b.trust[q] = trust if b.angle[q] < limit else 0.0
-
-
-@fast_kernel
 def estimate_normal(
     sample: Cube32,
     position: Vector,
@@ -696,5 +560,3 @@ def estimate_normal(
             for k in range(3):
                 meat[j, k] += both * b.light[j, i] * b.light[k, i]
     _sandwich(b.turn[0], meat, b.turn[1], out.cross)
-    _peak(n_cameras, b)
-    _robust_mean(n_cameras, out.peak, b)

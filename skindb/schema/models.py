@@ -13,11 +13,6 @@ SHADING_NORMAL = declare(
     f"{PAPER}, section 6",
     Use.SAMPLED | Use.SURVIVES_EDIT,
 )
-NORMAL_DISAGREEMENT = declare(
-    "float32 fitted/normal_disagreement(surfel) [degree]",
-    "angle between the peak-reflectance and the photometric normal",
-    uses=Use.REPORTED | Use.EXPORTED,
-)
 NORMAL_ERROR = declare(
     "float32 fitted/normal_error(surfel) [degree]",
     "standard error of shading_normal (RMS angle): noise of the samples and error of "

@@ -120,41 +120,6 @@ def test_estimate_normals__are_those_of_the_plain_rule():
                 np.testing.assert_allclose(found.spread[s, q], spread, rtol=2e-3)
 
 
-def _naive_peak(part, to_light, to_camera):
-    half = []
-    contrast = []
-    for o in range(len(to_camera)):
-        dark = part[:, o].min(-1)
-        lights = np.flatnonzero(np.isfinite(dark))
-        if len(lights) < 5:
-            continue
-        top = lights[np.argsort(-dark[lights])[:5]]
-        maximum = _unit(((dark[top] - dark[top[4]])[:, None] * to_light[top]).sum(0))
-        half.append(_unit(maximum + to_camera[o]))
-        contrast.append(max(dark[top[0]] / np.median(dark[lights]) - 1, 0))
-    half = np.array(half)
-    contrast = np.array(contrast)
-    mean = _unit(contrast @ half)
-    for _ in range(8):
-        angle = np.degrees(np.arccos(np.clip(half @ mean, -1, 1)))
-        near = angle < 2.5 * max(1.4826 * np.median(angle[contrast > 0]), 2)
-        mean = _unit((near * contrast / np.maximum(angle, 1)) @ half)
-    return mean
-
-
-def test_estimate_normals__peak_is_that_of_the_plain_rule():
-    for seed in [3, 4]:
-        sample, position, light, camera, scan = _scene(seed)
-        found = _estimates(sample, position, light, camera, scan)
-        for s in range(len(sample)):
-            to_light, to_camera = _directions(s, position, light, camera)
-            seen = to_camera @ scan[s] > 0.2
-            expected = _naive_peak(
-                sample[s][:, seen].astype(np.float64), to_light, to_camera[seen]
-            )
-            np.testing.assert_allclose(found.peak[s], expected, atol=1e-6)
-
-
 def test_estimate_normals__covariance_is_the_scatter_of_repeated_draws():
     rng = np.random.default_rng(5)
     _, position, light, camera, scan = _scene(6, surfels=1, lights=60, cameras=1)
