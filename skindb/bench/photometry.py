@@ -14,7 +14,7 @@ from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.bench.surface import spiral, unit
 from skindb.calibration._merge_kernels import OK
 from skindb.calibration.radiance import merge_exposures
-from skindb.fit import albedo, estimate_diffuse_reflectance, estimate_normals, normals
+from skindb.fit import estimate_diffuse_reflectance, estimate_normals, normals
 from skindb.format.frames import FrameKind
 from skindb.format.sensor import SensorRecord
 from skindb.optics.fresnel import fresnel_transmittance
@@ -188,37 +188,25 @@ def _angles(normal: Array, true: Array) -> Array:
 
 
 def albedo_curves(quick: bool) -> list[Curve]:
-    """Every method by size of the dome, and the paper's rule by the number of smallest
-    ratios that it discards.
-    """
-    points = []
+    """The estimate by size of the dome."""
     domes = _domes(quick)
-    for samples, skin in domes:
-        points += [
-            _albedo(skin, method, samples, method=method) for method in albedo.METHODS
-        ]
-    samples, skin = domes[-1]
-    for k in (0, 8, 32) if quick else (0, 1, 4, 8, 16, 32, 64):
-        rule = {"method": "minimum", "discard": k}
-        points.append(_albedo(skin, "minimum by discard", f"{k} discarded", **rule))
     return [
         Curve(
             kernel="albedo",
             error_of="median relative error of R_d",
             reference=f"true R_d of samples of the model, {NOISE:.0%} noise, true normals",
             seconds_of="a surfel",
-            base=f"minimum, {samples}",
-            points=points,
+            base=f"separated, {domes[-1][0]}",
+            points=[_albedo(skin, samples) for samples, skin in domes],
         )
     ]
 
 
-def _albedo(skin: ModelSamples, name: str, samples: str, **options: Any) -> Point:
+def _albedo(skin: ModelSamples, samples: str) -> Point:
     lumitexels = skin.with_normals
-    options["eta"] = ETA
     # compiles
-    estimate_diffuse_reflectance(lumitexels.isel(surfel=slice(0, 2)), **options)
-    work = partial(estimate_diffuse_reflectance, lumitexels, **options)
+    estimate_diffuse_reflectance(lumitexels.isel(surfel=slice(0, 2)), eta=ETA)
+    work = partial(estimate_diffuse_reflectance, lumitexels, eta=ETA)
     seconds, estimate = cpu_time(work, len(skin.normal))
     relative = estimate[variables.DIFFUSE_REFLECTANCE].values / skin.diffuse - 1
     estimated = float(np.isfinite(relative).all(1).mean())
@@ -227,7 +215,7 @@ def _albedo(skin: ModelSamples, name: str, samples: str, **options: Any) -> Poin
         failure = f"{1 - estimated:.0%} of the surfels have too few samples"
     details = {"bias": float(np.nanmedian(relative)), "estimated": estimated}
     error = float(np.nanmedian(np.abs(relative)))
-    return Point(name, samples, seconds, error, failure, details)
+    return Point("separated", samples, seconds, error, failure, details)
 
 
 def exposures_curves(quick: bool) -> list[Curve]:

@@ -1,6 +1,4 @@
-"""Diffuse reflectance: recovery, independence of highlights, and the paper's rule
-compared with a plain loop.
-"""
+"""Diffuse reflectance: recovery, and independence of highlights."""
 
 from __future__ import annotations
 
@@ -14,12 +12,7 @@ from skindb.fit import (
     estimate_diffuse_reflectance,
     estimate_normals,
 )
-from skindb.fit.albedo import (
-    METHODS,
-    block_reflectance,
-    low_quantile,
-    stable_minimum,
-)
+from skindb.fit.albedo import block_reflectance
 from skindb.optics.diffusion import diffuse_reflectance
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.mixture import basis_rows
@@ -32,23 +25,17 @@ def _with_normals(skin):
     return skin.lumitexels.assign(shading_normal=label("shading_normal", skin.normal))
 
 
-@pytest.mark.parametrize(
-    ("method", "limit"), [("separated", 0.02), ("quantile", 0.08), ("minimum", 0.08)]
-)
-def test_estimate_diffuse_reflectance__recovers_truth(skin, method, limit):
-    found = estimate_diffuse_reflectance(_with_normals(skin), method=method)
+def test_estimate_diffuse_reflectance__recovers_truth(skin):
+    found = estimate_diffuse_reflectance(_with_normals(skin))
     error = np.abs(found["diffuse_reflectance"].values / skin.diffuse - 1)
-    assert np.median(error) < limit
+    assert np.median(error) < 0.02
 
 
 def test_estimate_diffuse_reflectance__without_gloss_or_noise_is_exact(new_skin):
     skin = new_skin(gloss=0.0, noise=0.0)
+    found = estimate_diffuse_reflectance(_with_normals(skin))["diffuse_reflectance"]
     # half floats: 5e-4
-    for method, limit in (("separated", 1e-3), ("quantile", 2e-3), ("minimum", 3e-3)):
-        found = estimate_diffuse_reflectance(_with_normals(skin), method=method)[
-            "diffuse_reflectance"
-        ].values
-        assert np.abs(found / skin.diffuse - 1).max() < limit
+    assert np.abs(found.values / skin.diffuse - 1).max() < 1e-3
 
 
 def test_estimate_diffuse_reflectance__white_gloss_leaves_the_colour_alone(new_skin):
@@ -193,10 +180,9 @@ def test_estimate_diffuse_reflectance__dipole_s_inverts_eq5(skin):
 
 def test_estimate_diffuse_reflectance__too_few_samples_are_nan(skin):
     few = _with_normals(skin).isel(light=[0], camera=[0])
-    for method in ("separated", "quantile", "minimum"):
-        found = estimate_diffuse_reflectance(few, method=method)
-        assert np.isnan(found["diffuse_reflectance"].values).all()
-        assert np.isnan(found["diffuse_reflectance_error"].values).all()
+    found = estimate_diffuse_reflectance(few)
+    assert np.isnan(found["diffuse_reflectance"].values).all()
+    assert np.isnan(found["diffuse_reflectance_error"].values).all()
 
 
 def test_estimate_diffuse_reflectance__black_and_overbright_are_clamped(skin):
@@ -210,40 +196,7 @@ def test_estimate_diffuse_reflectance__black_and_overbright_are_clamped(skin):
         np.testing.assert_allclose(found, limit, rtol=1e-6)
 
 
-def test_stable_minimum__without_penalty_is_the_rank():
-    rng = np.random.default_rng(3)
-    ratio = np.where(
-        rng.uniform(size=(5, 40, 3)) < 0.2, np.nan, rng.uniform(0.2, 0.9, (5, 40, 3))
-    )
-    found, _ = stable_minimum(ratio, np.ones((5, 40)), 3)
-    np.testing.assert_array_equal(found, np.sort(ratio, axis=1)[:, 3])
-
-
-def test_stable_minimum__grazing_values_are_passed_over():
-    ratio = np.full((1, 20, 3), 0.5)
-    ratio[0, 7] = 0.45
-    grazing = np.ones((1, 20))
-    grazing[0, 7] = 0.1
-    assert stable_minimum(ratio, np.ones((1, 20)), 0)[0][0, 0] == 0.45
-    assert stable_minimum(ratio, grazing, 0)[0][0, 0] == 0.5
-
-
-def test_low_quantile__bias_does_not_grow_with_the_number_of_samples():
-    rng = np.random.default_rng(4)
-    means = [
-        low_quantile(0.4 + 0.02 * rng.normal(size=(200, n, 3)))[0].mean()
-        for n in (100, 1600)
-    ]
-    assert abs(means[0] - means[1]) < 0.002
-    # the tenth percentile of noise lies 1.2816 deviations low; half of that is given back
-    assert abs(means[1] - (0.4 - 0.6408 * 0.02)) < 0.001
-    draws = (0.4 + 0.02 * rng.normal(size=(200, n, 3)) for n in (100, 1600))
-    minimum = [stable_minimum(x, np.ones(x.shape[:2]), 2)[0].mean() for x in draws]
-    assert minimum[1] < minimum[0] - 0.01  # the paper's rule changes
-
-
-@pytest.mark.parametrize("method", ["separated", "quantile", "minimum"])
-def test_estimate_diffuse_reflectance__grazing_samples_do_not_count(skin, method):
+def test_estimate_diffuse_reflectance__grazing_samples_do_not_count(skin):
     lumitexels = _with_normals(skin)
     position = lumitexels["surfel_position"].values
     spoiled = lumitexels["reflectance_sample"].copy(deep=True)
@@ -255,10 +208,8 @@ def test_estimate_diffuse_reflectance__grazing_samples_do_not_count(skin, method
         grazing = np.expand_dims(cosine < 0.24, (3 - axis, 3))
         spoiled.values[np.broadcast_to(grazing, spoiled.shape)] *= 0.3
     assert (spoiled != lumitexels["reflectance_sample"]).any()
-    found = estimate_diffuse_reflectance(
-        lumitexels.assign(reflectance_sample=spoiled), method=method
-    )
-    clean = estimate_diffuse_reflectance(lumitexels, method=method)
+    found = estimate_diffuse_reflectance(lumitexels.assign(reflectance_sample=spoiled))
+    clean = estimate_diffuse_reflectance(lumitexels)
     np.testing.assert_allclose(
         found["diffuse_reflectance"], clean["diffuse_reflectance"], rtol=1e-6
     )
@@ -272,17 +223,7 @@ def test_estimate_diffuse_reflectance__any_chunking(skin):
         np.testing.assert_allclose(lazy[name].values, eager[name].values, rtol=1e-5)
 
 
-def test_estimate_diffuse_reflectance__unknown_method_is_refused(skin):
-    with pytest.raises(ValueError, match="method must be one of"):
-        estimate_diffuse_reflectance(_with_normals(skin), method="guess")
-
-
-# extreme inputs
-
-each_method = pytest.mark.parametrize("method", METHODS)
-
-
-def _of_surfels(skin, method, *, eta=1.3):
+def _of_surfels(skin, *, eta=1.3):
     """R_d (3, 3) of three surfels, and its error."""
     arrays = {
         "reflectance_sample": skin.sample,
@@ -291,60 +232,54 @@ def _of_surfels(skin, method, *, eta=1.3):
         "camera_position": skin.camera,
         "shading_normal": skin.normal,
     }
-    return block_reflectance(arrays, method=method, eta=eta)[:2]
+    return block_reflectance(arrays, eta=eta)[:2]
 
 
-@each_method
 @pytest.mark.parametrize("eta", [1.0, 1.3])
 @pytest.mark.parametrize(
     ("dtype", "tolerance"),
     [("float16", 1e-3), pytest.param("float32", 1e-5, marks=pytest.mark.slow)],
 )
-def test_block_reflectance__2400_samples_of_matte_skin(method, eta, dtype, tolerance):
+def test_block_reflectance__2400_samples_of_matte_skin(eta, dtype, tolerance):
     skin = surfels(150, 16, eta=eta, weight=MATTE, dtype=dtype)
-    estimate, _ = _of_surfels(skin, method, eta=eta)
+    estimate, _ = _of_surfels(skin, eta=eta)
     np.testing.assert_allclose(estimate, skin.diffuse, rtol=tolerance)
 
 
-@each_method
-def test_block_reflectance__one_or_three_samples_are_too_few(method):
+def test_block_reflectance__one_or_three_samples_are_too_few():
     for lights in (1, 3):
-        assert np.isnan(_of_surfels(surfels(lights, 1), method)).all()
+        assert np.isnan(_of_surfels(surfels(lights, 1))).all()
 
 
-@each_method
-def test_block_reflectance__broken_samples(method):
+def test_block_reflectance__broken_samples():
     skin = surfels()
-    estimate, _ = _of_surfels(skin.filled(np.nan), method)
+    estimate, _ = _of_surfels(skin.filled(np.nan))
     assert np.isnan(estimate[0]).all()
-    expected, _ = _of_surfels(skin, method)
+    expected, _ = _of_surfels(skin)
     np.testing.assert_allclose(estimate[1:], expected[1:], rtol=1e-7)
     matte = surfels(weight=MATTE)
     for value in (np.nan, np.inf):
-        estimate, _ = _of_surfels(matte.spoiled(value), method)
+        estimate, _ = _of_surfels(matte.spoiled(value))
         np.testing.assert_allclose(estimate, matte.diffuse, rtol=2e-3)
 
 
 @pytest.mark.slow
-@each_method
-def test_block_reflectance__any_scale_is_clamped_to_the_range_of_eq_5(method):
+def test_block_reflectance__any_scale_is_clamped_to_the_range_of_eq_5():
     skin = surfels(weight=MATTE, dtype=np.float32)
     for factor in (0.0, 1e-30, 1e3, 1e30):
-        estimate, _ = _of_surfels(skin.scaled(factor), method)
+        estimate, _ = _of_surfels(skin.scaled(factor))
         limit = SMALLEST_R_D if factor < 1 else LARGEST_R_D
         np.testing.assert_allclose(estimate, limit, rtol=1e-6)
 
 
 @pytest.mark.slow
-@each_method
-def test_block_reflectance__half_floats_have_the_same_result_in_any_precision(method):
+def test_block_reflectance__half_floats_have_the_same_result_in_any_precision():
     skin = surfels()
-    expected, _ = _of_surfels(skin, method)
+    expected, _ = _of_surfels(skin)
     for dtype in (np.float32, np.float64):
         typed = replace(skin, sample=skin.sample.astype(dtype))
-        np.testing.assert_allclose(_of_surfels(typed, method)[0], expected, rtol=1e-6)
+        np.testing.assert_allclose(_of_surfels(typed)[0], expected, rtol=1e-6)
 
 
-@each_method
-def test_block_reflectance__no_surfels(method):
-    assert _of_surfels(surfels().empty, method)[0].shape == (0, 3)
+def test_block_reflectance__no_surfels():
+    assert _of_surfels(surfels().empty)[0].shape == (0, 3)

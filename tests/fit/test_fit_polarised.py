@@ -72,7 +72,7 @@ def test_block_reflectance__crossed_samples_show_even_reflection():
             "shading_normal": skin.normal,
             "light_polarisation": light,
         }
-        value, _, total, _ = block_reflectance(arrays, method="separated", eta=ETA)
+        value, _, total, _ = block_reflectance(arrays, eta=ETA)
         excess = (value - skin.diffuse) / EVEN
         assert excess.min() > low - 0.05
         assert excess.max() < high
