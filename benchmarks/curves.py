@@ -19,16 +19,17 @@ from sklearn.decomposition import PCA
 import skindb.bench
 from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.bench.surface import DISC, unit
-from skindb.fit.translucency import MODELS
 from skindb.numerics.factorise import principal_axes
 from skindb.numerics.inference import permutation_p
 from skindb.optics.angles import directions, half_difference
+from skindb.optics.diffusion import dipole_profile
 from skindb.optics.transport import (
     ANISOTROPY,
     half_space_profile,
     moment_basis,
     radial_profile,
     random_walk,
+    transport_profile,
 )
 from skindb.reflectance.dictionary import (
     FAR_RULE,
@@ -49,6 +50,7 @@ DIFFUSION = (
 )
 TAKES = 87
 AXES = 5
+MODELS = {"transport": transport_profile, "dipole": dipole_profile}
 
 
 def transport_curves(quick: bool) -> list[Curve]:
@@ -69,10 +71,10 @@ def transport_curves(quick: bool) -> list[Curve]:
         ring = across(middle)
         setting = f"albedo {albedo:g}"
         for name, model in MODELS.items():
-            model.profile(1.0, ratio, 1.0, eta=ETA)  # makes the table
-            work = partial(model.profile, r, ratio, 1.0, eta=ETA)
+            model(1.0, ratio, 1.0, eta=ETA)  # makes the table
+            work = partial(model, r, ratio, 1.0, eta=ETA)
             seconds, _ = cpu_time(work, len(r))
-            profile = model.profile(ring, ratio, 1.0, eta=ETA)
+            profile = model(ring, ratio, 1.0, eta=ETA)
             mean = ring_mean(profile, middle)
             points.append(_profile(f"skindb {name}", setting, seconds, mean, walked))
         for degree in (3, 7, 11) if quick else (3, 5, 7, 9, 11, 13):

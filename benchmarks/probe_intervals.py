@@ -36,7 +36,6 @@ def draws(count, *, relative, floor, free, seed=1):
             error,
             radius=0.0,
             eta=1.3,
-            model="transport",
             free_gain=free,
         )
         if fit.status != ProbeStatus.TOO_FEW_FIBRES:

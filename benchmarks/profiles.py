@@ -13,8 +13,7 @@ from typing import Annotated
 
 import numpy as np
 
-from benchmarks.curves import across, ring_mean, rings
-from skindb.fit.translucency import MODELS
+from benchmarks.curves import MODELS, across, ring_mean, rings
 from skindb.optics.transport import random_walk
 
 ALBEDO = (0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 0.999)  # reduced
@@ -61,9 +60,9 @@ def _compare(walk, albedo, eta):
     value, noise = rings(walk, ratio, middle, WIDTH)
     for name, model in MODELS.items():
         mean = ring_mean(
-            model.profile(across(middle, WIDTH), ratio, 1.0, eta=eta), middle, WIDTH
+            model(across(middle, WIDTH), ratio, 1.0, eta=eta), middle, WIDTH
         )
-        seconds = _seconds(model.profile, 1 - albedo, albedo, eta)
+        seconds = _seconds(model, 1 - albedo, albedo, eta)
         for d, v, e, m in zip(DISTANCE, value, noise, mean, strict=True):
             off = m / v - 1 if v > 0 else np.nan
             rows.append(

@@ -194,8 +194,6 @@ class FitParameters(Limited):
     ----------
     k
         Number of components of the reduced basis; fewer if fewer surfels are fitted.
-    profile
-        Model of the probe's profiles, see `fit_probe`.
     surface
         Surface model: a mixture of the BRDFs of a dictionary, or one GGX lobe.
     mode, rank
@@ -226,9 +224,6 @@ class FitParameters(Limited):
     """
 
     k: int = option(4, "Number of basis BRDFs of a mixture.", minimum=1)
-    profile: Literal["transport", "dipole"] = option(
-        "transport", "Model of the probe profiles; dipole is that of the paper."
-    )
     surface: Literal["mixture", "ggx"] = option(
         "mixture", "Surface model: mixture of measured BRDFs, or one GGX lobe."
     )

@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 
 from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.errors import input_error
-from skindb.fit.translucency import MODELS, ProbeFit, fit_profile
+from skindb.fit.translucency import ProbeFit, fit_profile
 from skindb.optics.diffusion import (
     S_MAX,
     diffuse_reflectance,
@@ -27,6 +27,7 @@ from skindb.optics.transport import (
     Walk,
     radial_profile,
     random_walk,
+    transport_profile,
 )
 from skindb.types import Array, Float32
 
@@ -147,8 +148,8 @@ def _exact(value: float) -> float:
 
 
 def probe_curves(quick: bool) -> list[Curve]:
-    """sigma_tr from the fibres of the probe, by profile model, number of fibres, and
-    known or fitted gain.
+    """sigma_tr from the fibres of the probe, by number of fibres, and known or
+    fitted gain.
     """
     walk = _walk(quick)
     skin = SKIN[1:4:2] if quick else SKIN
@@ -156,22 +157,20 @@ def probe_curves(quick: bool) -> list[Curve]:
     photons = [radial_profile(walk, a, s, edges) for a, s in skin]
     true = np.array([sigma_tr(a, s) for a, s in skin])
     points = []
-    for model in MODELS:
-        MODELS[model].profile(1.0, *SKIN[0], eta=ETA)  # makes the table
-        for free in (False, True):
-            for fibres in (28,) if quick else (4, 6, 8, 12, 28):
-                work = partial(_fits, model, free, fibres, photons)
-                seconds, fits = cpu_time(work, len(skin))
-                off = np.array([fit.sigma_tr for fit in fits]) / true - 1
-                failure = _failure_of_fits(off, free)
-                details = {
-                    f"{a:g}, {s:g}": float(e)
-                    for (a, s), e in zip(skin, off, strict=True)
-                }
-                name = f"skindb {model}, gain {'fitted' if free else 'known'}"
-                setting = f"{fibres} fibres"
-                error = float(np.sqrt(np.nanmean(off**2)))
-                points.append(Point(name, setting, seconds, error, failure, details))
+    transport_profile(1.0, *SKIN[0], eta=ETA)  # makes the table
+    for free in (False, True):
+        for fibres in (28,) if quick else (4, 6, 8, 12, 28):
+            work = partial(_fits, free, fibres, photons)
+            seconds, fits = cpu_time(work, len(skin))
+            off = np.array([fit.sigma_tr for fit in fits]) / true - 1
+            failure = _failure_of_fits(off, free)
+            details = {
+                f"{a:g}, {s:g}": float(e) for (a, s), e in zip(skin, off, strict=True)
+            }
+            name = f"skindb transport, gain {'fitted' if free else 'known'}"
+            setting = f"{fibres} fibres"
+            error = float(np.sqrt(np.nanmean(off**2)))
+            points.append(Point(name, setting, seconds, error, failure, details))
     return [
         Curve(
             kernel="probe",
@@ -180,14 +179,14 @@ def probe_curves(quick: bool) -> list[Curve]:
                 f"random walk of {walk.packets:,} photons through media of known coefficients"
             ),
             seconds_of="a profile",
-            base=f"skindb dipole, gain known, {len(FIBRES)} fibres",
+            base=f"skindb transport, gain known, {len(FIBRES)} fibres",
             points=points,
         )
     ]
 
 
 def _fits(
-    model: str, free: bool, fibres: int, photons: Sequence[tuple[Array, Array]]
+    free: bool, fibres: int, photons: Sequence[tuple[Array, Array]]
 ) -> list[ProbeFit]:
     return [
         fit_profile(
@@ -196,7 +195,6 @@ def _fits(
             error[:fibres],
             radius=0.0,
             eta=ETA,
-            model=model,
             free_gain=free,
         )
         for value, error in photons

@@ -325,7 +325,7 @@ def _translucency(
     sigma_tr.
     """
     probe = groups["probe"]
-    sites = fit_probe(probe, eta=parameters.eta, profile=parameters.profile)
+    sites = fit_probe(probe, eta=parameters.eta)
     sites = sites.merge(probe[["site_position"]])
     fitted = groups["fitted"].merge(translucency_map(groups["fitted"], sites))
     return {"translucency": sites, "fitted": fitted}

@@ -5,7 +5,7 @@ one diffuse reflectance profile, and sigma_tr of the sites and of the surfels.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,11 +14,15 @@ import xarray as xr
 from scipy.optimize import least_squares
 from scipy.special import chdtrc
 
-from skindb.optics.diffusion import dipole_profile
 from skindb.optics.transport import RATIO_MAX, transport_profile
 from skindb.schema import IDENTIFIED, ProbeStatus, check, dataset, label
 from skindb.types import Array
 
+# relative errors of transport profiles: at one transport mean free path, which falls like
+# 1/r; at a distance; and of sigma_tr in fits to noise-free random walks
+NEAR_ERROR = 0.02
+FAR_ERROR = 0.004
+SIGMA_TR_ERROR = 0.01
 MIN_FIBRE_SIGNAL = 3.0  # standard errors above zero for a fibre to be used
 MIN_FIBRES = 3
 # bounds of sigma_tr, sigma_s' [mm^-1] and the logarithm of the gain in units of the profile
@@ -49,7 +53,6 @@ RARE_CHI_SQUARED = 1e-6
 # most half of it
 CLEAR = 0.05
 PER_FIBRE = ("distance", "face", "log_profile", "error")
-PROFILE_NAMES = ("transport", "dipole")
 PROBE = (
     "fibre_profile",
     "fibre_profile_error",
@@ -106,25 +109,6 @@ class ProbeFit:
 
 
 @dataclass(frozen=True)
-class Model:
-    """A profile model R(r), and its errors."""
-
-    profile: Callable[..., Array]
-    near: float  # relative error at one transport mean free path; falls like 1/r
-    far: float  # relative error at a distance
-    # relative error of sigma_tr in fits to noise-free random walks where the albedo is
-    # near 1
-    bright: float
-    dark: float  # additional relative error per 1 - alpha'
-
-
-MODELS = {
-    "transport": Model(transport_profile, 0.02, 0.004, 0.01, 0.0),
-    "dipole": Model(dipole_profile, 0.15, 0.01, 0.03, 0.25),
-}
-
-
-@dataclass(frozen=True)
 class Problem:
     """Usable fibres of one profile."""
 
@@ -133,15 +117,13 @@ class Problem:
     log_profile: Array  # (f,)
     error: Array  # (f,) in units of the profile
     eta: float
-    model: Model
     free_gain: bool
 
     def predict(self, p: Array) -> Array:
         """Logarithms (..., f) predicted by the model for parameters (..., 2 or 3)."""
         a, s = (x[..., None, None] for x in _coefficients(p))
-        value = (self.model.profile(self.distance, a, s, eta=self.eta) * self.face).sum(
-            -1
-        )
+        profile = transport_profile(self.distance, a, s, eta=self.eta)
+        value = (profile * self.face).sum(-1)
         return np.asarray(
             np.log(np.maximum(value, 1e-300)) + (p[..., 2:] if self.free_gain else 0.0)
         )
@@ -183,8 +165,7 @@ class Problem:
         """Error of the model at each distance."""
         a, s = _coefficients(p)
         return np.asarray(
-            self.model.near / (self.distance.mean(1) * (a + s)[..., None])
-            + self.model.far
+            NEAR_ERROR / (self.distance.mean(1) * (a + s)[..., None]) + FAR_ERROR
         )
 
     def weight(self, p: Array) -> Array:
@@ -199,7 +180,6 @@ def fit_profile(
     *,
     radius: float,
     eta: float,
-    model: str,
     free_gain: bool,
 ) -> ProbeFit:
     """Least squares between logarithms in log sigma_tr, log sigma_s' (and log gain),
@@ -221,7 +201,6 @@ def fit_profile(
         np.log(profile[good]),
         error[good],
         eta,
-        MODELS[model],
         free_gain,
     )
     minimum, rival = _best(problem)
@@ -348,8 +327,7 @@ def _report(minimum: Any, problem: Problem, *, rival: float, near: float) -> Pro
     sd = np.sqrt(np.diag(covariance))
     error = float(max(sd[0], rival, near))
     a, s = map(float, _coefficients(p))
-    model_error = problem.model.bright + problem.model.dark * a / (a + s)
-    off = float(np.hypot(gain @ problem.discrepancy(p), model_error))
+    off = float(np.hypot(gain @ problem.discrepancy(p), SIGMA_TR_ERROR))
     tr = float(np.exp(p[0]))
     unexplained, chance = _unexplained(problem, p)
     all_near = tr * problem.distance.max() < 1
@@ -432,9 +410,7 @@ def _unexplained(problem: Problem, p: Array) -> tuple[float, float]:
     )
 
 
-def fit_probe(
-    probe: xr.Dataset, *, eta: float = 1.3, profile: str = "transport"
-) -> xr.Dataset:
+def fit_probe(probe: xr.Dataset, *, eta: float = 1.3) -> xr.Dataset:
     """Absorption, scattering and sigma_tr of every site and channel.
 
     Parameters
@@ -446,8 +422,6 @@ def fit_probe(
         [mm].
     eta
         Refractive index of the boundary.
-    profile
-        "transport" (`skindb.optics.transport`) or "dipole" (Jensen et al. 2001, the paper's).
 
     Returns
     -------
@@ -461,13 +435,11 @@ def fit_probe(
 
     Notes
     -----
-    The dipole has errors of 10 to 50 % at some transport mean free paths, more where
-    the albedo is low: its sigma_tr is 4 % too low at albedo 0.9 and 25 % at 0.3.
-    "transport" is within 1.3 % on random walks of albedo 0.96 to 0.19 and changes by
-    0.4 % if the anisotropy is 0.7 to 0.95 instead of 0.8. The error of a profile at
-    each distance lowers the weight of near fibres. 95 % intervals of sigma_tr contain
-    the truth in 96 % of 800 noisy profiles drawn from the model, with a known and with
-    a free gain (`benchmarks/probe_intervals.py`).
+    Profiles are those of `skindb.optics.transport`. sigma_tr is within 1.3 % on random
+    walks of albedo 0.96 to 0.19 and changes by 0.4 % if the anisotropy is 0.7 to 0.95
+    instead of 0.8. The error of a profile at each distance lowers the weight of near
+    fibres. 95 % intervals of sigma_tr contain the truth in 96 % of 800 noisy profiles
+    drawn from the model, with a known and with a free gain (`benchmarks/probe_intervals.py`).
 
     With a free gain sigma_s' has the prior of skin (1.5 mm^-1, a factor of two), and
     all minima along sigma_s' are refined: those that are not excluded enter the error
@@ -475,12 +447,10 @@ def fit_probe(
     that exceeds its stated errors: 30 % at 8 mm make sigma_tr 30 to 70 % too high with
     a free gain and less than 3 % with a known one. Measure the gain.
     """
-    if profile not in PROFILE_NAMES:
-        raise ValueError(f"profile must be one of {PROFILE_NAMES}, not {profile!r}")
     check(probe, PROBE, where="probe")
     free = not bool(probe["gain_known"])
     radius = float(probe["fibre_radius"])
-    fits = _fit_each(probe, eta=eta, radius=radius, model=profile, free_gain=free)
+    fits = _fit_each(probe, eta=eta, radius=radius, free_gain=free)
     shape = probe.sizes["site"], probe.sizes["channel"]
     columns = {
         name: np.asarray(
@@ -494,7 +464,6 @@ def fit_probe(
     return dataset(
         columns,
         coords=coords | {"parameter": ["sigma_tr", "sigma_s_prime"]},
-        attrs={"profile": profile},
     )
 
 

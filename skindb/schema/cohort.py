@@ -28,7 +28,6 @@ COMPARED = (
     "mode",
     "rank",
     "eta",
-    "profile",
     "surface_energy",
     "surface_energy_error",
     "hold_out_lights",

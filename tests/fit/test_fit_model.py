@@ -129,11 +129,6 @@ def test_fit_model__recovers_truth(fitted, skin):
     np.testing.assert_allclose(
         found["sigma_tr"].values, np.tile(true, (len(seen), 1)), rtol=1e-3
     )
-    assert (
-        model.attrs["parameters"]["profile"]
-        == model["translucency"].attrs["profile"]
-        == "transport"
-    )
 
 
 def test_fit_model__unseen_surfels_have_a_status_and_nothing_else(fitted):
