@@ -17,24 +17,25 @@ from skindb.errors import require
 from skindb.geometry.atlas import bilinear, push_pull
 from skindb.numerics.factorise import principal_axes
 from skindb.numerics.texture import (
+    BINS,
     QUANTILES,
+    Bins,
     Synthesis,
+    common_bins,
     image_parts,
-    level_fractions,
-    members,
-    part_histogram,
+    part_members,
     part_names,
     part_quantiles,
+    quantile_function,
     synthesise,
 )
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.label import FACE
-from skindb.types import Array, Mask
+from skindb.types import Array, Index, Mask
 
 SIZE = 1024  # texels along each side
 REGIONS = (FACE, "beard", "no_beard")
-BINS = 256
 MAPPED = (variables.TEXEL_DIFFUSE_REFLECTANCE, variables.TEXEL_COVERAGE)
 LEAST_COVERED = 0.5  # fraction of the texels of a region that a take must have measured
 COVERED = 0.5  # coverage above which a texel counts as measured
@@ -78,7 +79,9 @@ def texture_statistics(
     with the same weight, divided by their standard deviations (Heeger and Bergen 1995,
     section 3.5). Every axis is decomposed into a steerable pyramid of 7 levels and 4
     orientations; its 30 parts and the image itself have 256 bins each, with the same
-    edges for all takes: 23,808 numbers for each take and region.
+    edges for all takes: 23,808 numbers for each take and region. The width of the bins
+    is the smallest power of 2 with which they contain every texel of every take, so
+    that every take is read once for them.
 
     Parameters
     ----------
@@ -109,27 +112,23 @@ def texture_statistics(
     names = list(masks)
     drawn = np.stack([masks[name] for name in names])
     mean, axes = _axes(each_take(_moments, cohort, MAPPED))
-    distributions = each_take(_distributions, cohort, MAPPED, drawn, mean, axes)
+    takes = each_take(_distributions, cohort, MAPPED, drawn, mean, axes)
     require(
-        np.isfinite(np.stack([row[0] for row in distributions])).any(),
+        any(np.isfinite(take.quantiles).any() for take in takes),
         "texture",
         "at least one take must have measured half of a region",
-        f"none of {len(distributions)} takes",
+        f"none of {len(takes)} takes",
         "fit or register more takes",
     )
-    quantiles, low, high, covered = (
-        np.stack(column) for column in zip(*distributions, strict=True)
-    )
-    edges = _edges(np.nanmin(low, axis=(0, 1)), np.nanmax(high, axis=(0, 1)))
-    histograms = each_take(_histograms, cohort, MAPPED, drawn, mean, axes, edges)
+    edges, histograms = _histograms(takes)
     return dataset(
         {
             variables.TEXTURE_COLOUR_MEAN: mean,
             variables.TEXTURE_COLOUR_AXIS: axes,
             variables.TEXTURE_EDGE: edges,
-            variables.TEXTURE_HISTOGRAM: np.stack(histograms),
-            variables.TEXTURE_QUANTILE: quantiles,
-            variables.TEXTURE_COVERAGE: covered,
+            variables.TEXTURE_HISTOGRAM: histograms,
+            variables.TEXTURE_QUANTILE: np.stack([take.quantiles for take in takes]),
+            variables.TEXTURE_COVERAGE: np.stack([take.covered for take in takes]),
             variables.TEXTURE_REGION: drawn,
         },
         coords={
@@ -142,35 +141,49 @@ def texture_statistics(
     )
 
 
+@dataclass(frozen=True)
+class Distributions:
+    """Distributions of a take's texels in each region, axis and part."""
+
+    quantiles: Array  # (region, axis, part, QUANTILES)
+    bins: list[list[Bins]]  # of each axis and part; empty without measured regions
+    covered: Array  # (region,) fraction of its texels that are measured
+
+
 def log_albedo(maps: xr.Dataset) -> tuple[Array, Mask]:
     """Log R_d (v, u, 3) of a map, extrapolated to texels without measurements, and the
     mask (v, u) of measured ones.
     """
     log, measured = _measured_log(maps)
-    if measured.any():
-        log, _ = push_pull(log, measured.astype(np.float32))
-    return log, measured
+    if not measured.any():
+        return np.zeros_like(log), measured
+    return push_pull(log, measured.astype(np.float32))[0], measured
 
 
 def _measured_log(maps: xr.Dataset) -> tuple[Array, Mask]:
+    """Log R_d (v, u, 3), NaN where it is unknown, and the mask (v, u) of measured texels."""
     albedo = maps[variables.TEXEL_DIFFUSE_REFLECTANCE].values
-    measured = (maps[variables.TEXEL_COVERAGE].values > COVERED) & np.isfinite(
-        albedo
-    ).all(axis=-1)
-    return np.log(np.maximum(np.nan_to_num(albedo, nan=1.0), DARKEST)), measured
+    measured = maps[variables.TEXEL_COVERAGE].values > COVERED
+    for channel in range(albedo.shape[-1]):
+        measured &= np.isfinite(albedo[..., channel])
+    return np.log(np.maximum(albedo, DARKEST, dtype=albedo.dtype)), measured
 
 
 def decorrelated(log: Array, mean: Array, axes: Array) -> Array:
     """Coordinates (axis, v, u) on the decorrelated axes, in single precision."""
-    return np.ascontiguousarray(np.moveaxis((log - mean) @ axes.T, -1, 0), np.float32)
+    rows = (log - mean.astype(log.dtype)).reshape(-1, len(mean))
+    images = axes.astype(rows.dtype) @ rows.T
+    return images.reshape(-1, *log.shape[:-1]).astype(np.float32, copy=False)
 
 
 def _moments(maps: xr.Dataset) -> Moments | None:
     log, measured = _measured_log(maps)
     if not measured.any():
         return None
-    inside = log[measured].astype(float)
-    return Moments(inside.mean(axis=0), np.cov(inside.T, bias=True))
+    rows = log.reshape(-1, log.shape[-1]).take(np.flatnonzero(measured), axis=0)
+    mean = rows.mean(axis=0, dtype=float)
+    from_mean = rows - mean
+    return Moments(mean, from_mean.T @ from_mean / len(rows))
 
 
 def _axes(moments: list[Moments | None]) -> tuple[Array, Array]:
@@ -205,7 +218,7 @@ def colour_axes(
     return mean, axes * np.where(axes.sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
 
 
-def _covered(measured: Mask, drawn: Array) -> Array:
+def _covered(measured: Mask, drawn: Mask) -> Array:
     """Fraction (region,) of the texels of each region that are measured; for the face,
     of the whole map.
     """
@@ -215,75 +228,41 @@ def _covered(measured: Mask, drawn: Array) -> Array:
 
 
 def _distributions(
-    maps: xr.Dataset, drawn: Array, mean: Array, axes: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Quantiles (region, axis, part, level), minima and maxima (region, axis, part),
-    and coverage (region,).
-    """
+    maps: xr.Dataset, drawn: Mask, mean: Array, axes: Array
+) -> Distributions:
+    """Distributions of a take; NaN and no values for regions that it has not measured."""
     log, measured = log_albedo(maps)
     covered = _covered(measured, drawn)
-    count = len(part_names())
-    quantiles = np.full((len(drawn), AXES, count, QUANTILES), np.nan, np.float32)
-    low, high = np.full((2, len(drawn), AXES, count), np.nan)
-    weights: dict[int, list[Array]] = {}
-    for a, image in enumerate(decorrelated(log, mean, axes)):
-        parts = image_parts(image)
-        weights = weights or _part_weights(drawn, measured, covered, parts)
-        for r, weights_of_parts in weights.items():
-            quantiles[r, a] = part_quantiles(parts, weights_of_parts)
-            for p, (part, weight) in enumerate(
-                zip(parts, weights_of_parts, strict=True)
-            ):
-                inside = part[members(weight)]
-                if inside.size:
-                    low[r, a, p], high[r, a, p] = inside.min(), inside.max()
-    return quantiles, low, high, covered
-
-
-def _part_weights(
-    drawn: Array, measured: Mask, covered: Array, parts: list[Array]
-) -> dict[int, list[Array]]:
-    """Weights of the measured texels in each part of the pyramid, for the regions that
-    the take has measured.
-    """
-    shapes = [part.shape for part in parts]
     # the first region is the face, which needs no minimum coverage
-    regions = [
-        r
-        for r in range(len(drawn))
-        if (covered[r] >= LEAST_COVERED if r else measured.any())
-    ]
-    return {
-        r: level_fractions((drawn[r] & measured).astype(np.float32), shapes)
-        for r in regions
-    }
-
-
-def _edges(low: Array, high: Array) -> Array:
-    """Edges (axis, part, BINS + 1) of equal bins that contain every texel of every take."""
-    low = np.nan_to_num(low)
-    high = np.nan_to_num(high)
-    margin = 1e-6 * (high - low) + 1e-9
-    return np.moveaxis(np.linspace(low - margin, high + margin, BINS + 1), 0, -1)
-
-
-def _histograms(
-    maps: xr.Dataset, drawn: Array, mean: Array, axes: Array, edges: Array
-) -> Array:
-    """Histograms (region, axis, part, bin) as fractions of the texels."""
-    log, measured = log_albedo(maps)
-    covered = _covered(measured, drawn)
-    out = np.full((len(drawn), *edges.shape[:2], BINS), np.nan, np.float32)
-    weights: dict[int, list[Array]] = {}
+    enough = covered >= np.array([0.0, *[LEAST_COVERED] * (len(drawn) - 1)])
+    masks = drawn & measured & enough[:, None, None]
+    inside: list[list[Index]] = []
+    quantiles = np.empty((len(drawn), AXES, len(part_names()), QUANTILES), np.float32)
+    bins: list[list[Bins]] = []
     for a, image in enumerate(decorrelated(log, mean, axes)):
         parts = image_parts(image)
-        weights = weights or _part_weights(drawn, measured, covered, parts)
-        for r, weights_of_parts in weights.items():
-            for p, (part, weight) in enumerate(
-                zip(parts, weights_of_parts, strict=True)
-            ):
-                out[r, a, p] = part_histogram(part, weight, edges[a, p])
-    return out
+        inside = inside or [part_members(mask, parts) for mask in masks]
+        bins.append([])
+        for p, part in enumerate(parts):
+            values = [part.take(index[p]) for index in inside]
+            quantiles[:, a, p] = [quantile_function(region) for region in values]
+            bins[a].append(Bins.of(values))
+    return Distributions(quantiles, bins, covered)
+
+
+def _histograms(takes: Sequence[Distributions]) -> tuple[Array, Array]:
+    """Edges (axis, part, BINS + 1) that contain every texel of every take, and
+    fractions (take, region, axis, part, bin) of the texels of each take.
+    """
+    count, axes, parts, _ = takes[0].quantiles.shape
+    edges = np.empty((axes, parts, BINS + 1))
+    histograms = np.empty((len(takes), count, axes, parts, BINS), np.float32)
+    for a, p in np.ndindex(axes, parts):
+        bins = [take.bins[a][p] for take in takes]
+        exponent, first = common_bins(bins)
+        edges[a, p] = (first + np.arange(BINS + 1)) * 2.0**exponent
+        histograms[:, :, a, p] = [own.merged(exponent, first) for own in bins]
+    return edges, histograms
 
 
 @dataclass(frozen=True)
@@ -386,12 +365,8 @@ def _quantiles(images: Array | list[Array], counted: list[Array]) -> Array:
     out = []
     for image in images:
         parts = image_parts(np.asarray(image, np.float32))
-        shapes = [part.shape for part in parts]
         out.append(
-            [
-                part_quantiles(parts, level_fractions(mask.astype(np.float32), shapes))
-                for mask in counted
-            ]
+            [part_quantiles(parts, part_members(mask, parts)) for mask in counted]
         )
     return np.moveaxis(np.array(out), 0, 1)
 

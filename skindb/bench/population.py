@@ -11,7 +11,7 @@ from skindb.numerics.texture import (
     LEVELS,
     build,
     image_parts,
-    level_fractions,
+    part_members,
     part_quantiles,
     reconstruct,
     synthesise,
@@ -107,8 +107,7 @@ def textures_curves(quick: bool) -> list[Curve]:
 
 def _quantiles(image: Array, levels: int) -> Array:
     parts = image_parts(image, levels)
-    shapes = [part.shape for part in parts]
-    return part_quantiles(parts, level_fractions(np.ones(image.shape), shapes))
+    return part_quantiles(parts, part_members(np.ones(image.shape), parts))
 
 
 def _largest(difference: Array) -> float:

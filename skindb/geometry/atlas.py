@@ -559,12 +559,13 @@ def push_pull(image: Array, confidence: Array) -> tuple[Image, Image]:
         (h, w): 1 where known; elsewhere that of the average it was filled from, 0 if
         nothing is known.
     """
-    filled = np.array(image, np.float32)
+    filled = np.array(image, np.float32, order="C")
     weight = np.nan_to_num(np.clip(np.asarray(confidence, np.float32), 0, 1))
-    weight[~np.isfinite(filled).all(axis=-1)] = 0
+    for channel in range(filled.shape[-1]):
+        weight[~np.isfinite(filled[..., channel])] = 0
     if not weight.any():
         return np.full_like(filled, np.nan), weight
-    filled[weight == 0] = 0
+    filled.reshape(-1, filled.shape[-1])[np.flatnonzero(weight == 0)] = 0
     levels = [(filled, weight)]
     while max(levels[-1][1].shape) > 1:
         height, width = ((n + 1) // 2 for n in levels[-1][1].shape)

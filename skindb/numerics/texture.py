@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from math import factorial, pi, sqrt
+from math import factorial, floor, frexp, pi, sqrt
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ from scipy.fft import fftfreq, irfft2, rfft2, rfftfreq
 from scipy.optimize import isotonic_regression
 from scipy.sparse import csr_array
 
-from skindb.types import Array, Float64, Mask, float64
+from skindb.types import Array, Float64, Index, Mask, float64
 
 Image = Array
 Spectrum = NDArray[np.complexfloating[Any, Any]]
@@ -35,6 +35,8 @@ LEVELS = 7
 ORIENTATIONS = 4
 MAX_SHAPES = LEVELS + 1  # whose masks are kept: 25 MB for images of 1024 x 1024
 QUANTILES = 256  # entries of a quantile function
+BINS = 256  # of a histogram
+MIN_EXPONENT = -126  # of the width of a bin: the inverse is finite in single precision
 # values; a quantile of this many is accurate to 0.14 % of all ranks, a third of a level
 MAX_SORTED = 1 << 17
 # standard deviation of the noise added before matching, relative to that of the
@@ -49,9 +51,9 @@ class Pyramid:
     """
 
     high: Image  # (h, w)
-    # one (orientations, h_k, w_k) per level, each level half as large as the previous
-    # one
-    bands: list[Image]
+    # one (h_k, w_k) per orientation of every level, each level half as large as the
+    # previous one
+    bands: list[list[Image]]
     low: Image  # (h_n, w_n)
 
     def parts(self) -> list[Image]:
@@ -61,7 +63,7 @@ class Pyramid:
     def with_parts(self, parts: list[Image]) -> Pyramid:
         """A pyramid of this layout with other images, in the order of `parts`."""
         ends = np.cumsum([1, *(len(level) for level in self.bands)]).tolist()
-        bands = [np.stack(parts[start:end]) for start, end in pairwise(ends)]
+        bands = [parts[start:end] for start, end in pairwise(ends)]
         return Pyramid(parts[0], bands, parts[-1])
 
 
@@ -116,7 +118,7 @@ def build(
         low, high = _low(size, shape, level + 1, kind)
         ring = spectrum * high * _phase(orientations, kind)
         masks = _angular(size, shape, orientations, kind)
-        bands.append(np.stack([_image(ring * mask, size) for mask in masks]))
+        bands.append([_image(ring * mask, size) for mask in masks])
         size = tuple((side + 1) // 2 for side in size)
         spectrum = _cropped(spectrum * low, size)
     return Pyramid(residual, bands, _image(spectrum, size))
@@ -131,7 +133,7 @@ def reconstruct(pyramid: Pyramid) -> Image:
     spectrum = _transform(pyramid.low)
     for level in reversed(range(len(pyramid.bands))):
         bands = pyramid.bands[level]
-        size = bands.shape[1:]
+        size = bands[0].shape
         low, high = _low(size, shape, level + 1, kind)
         ring = np.zeros(low.shape, spectrum.dtype)
         masks = _angular(size, shape, len(bands), kind)
@@ -318,24 +320,73 @@ def quantile_function(values: Image) -> Float64:
     return np.interp(quantile_levels() * len(flat) - 0.5, np.arange(len(flat)), flat)
 
 
-def part_quantiles(parts: Sequence[Image], fractions: Sequence[Image]) -> Float64:
-    """Quantiles (part, QUANTILES) of the entries of each part that belong to a region;
-    see `members`.
+def part_members(mask: Image, parts: Sequence[Image]) -> list[Index]:
+    """Flat indices of the entries of each part that belong to a region (h, w); see
+    `members`.
     """
-    pairs = zip(parts, fractions, strict=True)
-    return np.stack([quantile_function(part[members(mask)]) for part, mask in pairs])
+    shapes = [part.shape for part in parts]
+    fractions = dict(zip(shapes, level_fractions(mask, shapes), strict=True))
+    index = {shape: np.flatnonzero(members(f)) for shape, f in fractions.items()}
+    return [index[shape] for shape in shapes]
 
 
-def part_histogram(part: Image, fraction: Image, edges: Float64) -> Float64:
-    """Fractions (bins,) of the entries of a region in bins of equal width; the
-    outermost bins include all beyond.
+def part_quantiles(parts: Sequence[Image], inside: Sequence[Index]) -> Float64:
+    """Quantiles (part, QUANTILES) of the entries with these indices, see `part_members`."""
+    pairs = zip(parts, inside, strict=True)
+    return np.stack([quantile_function(part.take(index)) for part, index in pairs])
+
+
+@dataclass(frozen=True)
+class Bins:
+    """Numbers of values in bins whose width is a power of 2 and whose edges are
+    multiples of it, so that the bins of several parts merge into wider ones exactly.
     """
-    inside = part[members(fraction)]
-    bins = len(edges) - 1
-    if not inside.size:
-        return np.full(bins, np.nan)
-    place = ((inside - edges[0]) * (bins / (edges[-1] - edges[0]))).astype(int)
-    return np.bincount(np.clip(place, 0, bins - 1), minlength=bins) / inside.size
+
+    exponent: int  # of the width
+    first: int  # lower edge of the first bin over the width
+    last: int  # that of the last bin with values
+    counts: NDArray[np.uint32]  # (region, BINS)
+
+    @classmethod
+    def of(cls, regions: Sequence[Image]) -> Bins:
+        """The narrowest bins that contain the values (n,) of all regions; a bin at 0
+        without any.
+        """
+        low = min((float(x.min()) for x in regions if x.size), default=0.0)
+        high = max((float(x.max()) for x in regions if x.size), default=0.0)
+        # single precision distinguishes no narrower bins
+        exponent = max(frexp(max(abs(low), abs(high)))[1] - 24, MIN_EXPONENT)
+        while floor(high * 2.0**-exponent) - floor(low * 2.0**-exponent) >= BINS:
+            exponent += 1
+        first = floor(low * 2.0**-exponent)
+        counts = np.zeros((len(regions), BINS), np.uint32)
+        for row, values in zip(counts, regions, strict=True):
+            numbers = np.floor(values * values.dtype.type(2.0**-exponent)) - first
+            row[:] = np.bincount(numbers.astype(np.intp), minlength=BINS)
+        return cls(exponent, first, floor(high * 2.0**-exponent), counts)
+
+    def merged(self, exponent: int, first: int) -> Float64:
+        """Fractions (region, BINS) of the values of each region in wider bins, NaN for
+        a region without values.
+        """
+        place = (self.first + np.arange(self.last - self.first + 1)) >> (
+            exponent - self.exponent
+        )
+        counts = np.zeros(self.counts.shape)
+        np.add.at(counts.T, place - first, self.counts[:, : len(place)].T)
+        total = counts.sum(axis=1, keepdims=True)
+        return np.where(total > 0, counts / np.maximum(total, 1), np.nan)
+
+
+def common_bins(parts: Sequence[Bins]) -> tuple[int, int]:
+    """Exponent and first bin of the narrowest bins into which those of all parts merge."""
+    exponent = max(bins.exponent for bins in parts)
+    while True:
+        first = min(bins.first >> (exponent - bins.exponent) for bins in parts)
+        last = max(bins.last >> (exponent - bins.exponent) for bins in parts)
+        if last - first < BINS:
+            return exponent, first
+        exponent += 1
 
 
 def valid_quantiles(values: Float64) -> Float64:
@@ -423,7 +474,7 @@ class _Matching:
 
     blend: list[list[Image]]  # fraction of each region at the size of each part
     total: list[Image]  # sum of the fractions over the regions, for each part
-    measured: list[list[Image]]  # fractions of the entries that are measured
+    measured: list[list[Index]]  # entries that are measured, see `part_members`
     targets: Float64  # (region, part, QUANTILES)
     size: Float64  # (part,) number of entries
 
@@ -438,10 +489,8 @@ class _Matching:
         shapes = [part.shape for part in parts]
         blend = [level_fractions(region, shapes) for region in regions]
         total = [np.maximum(sum(masks), 1e-6) for masks in zip(*blend, strict=True)]
-        counted = blend
-        if measured is not None:
-            counted = [level_fractions(mask, shapes) for mask in measured]
-        sources = np.stack([part_quantiles(parts, masks) for masks in counted])
+        counted = [part_members(m, parts) for m in measured or regions]
+        sources = np.stack([part_quantiles(parts, inside) for inside in counted])
         sums = np.where(np.isfinite(shifts), sources + shifts, sources)
         size = np.array([part.size for part in parts], float)
         return cls(blend, total, counted, valid_quantiles(sums), size)
@@ -449,7 +498,7 @@ class _Matching:
     def quantiles(self, part: Image, k: int) -> Float64:
         """Quantile functions (region, QUANTILES) of part k."""
         return np.stack(
-            [quantile_function(part[members(masks[k])]) for masks in self.measured]
+            [quantile_function(part.take(inside[k])) for inside in self.measured]
         )
 
     def all_quantiles(self, parts: list[Image]) -> Float64:

@@ -17,7 +17,12 @@ from skindb.analysis.texture import (
     texture_statistics,
 )
 from skindb.errors import InputError
-from skindb.numerics.texture import quantile_function
+from skindb.numerics.texture import (
+    image_parts,
+    level_fractions,
+    members,
+    quantile_function,
+)
 from skindb.schema import dataset
 
 SIZE = 128
@@ -155,6 +160,26 @@ def test_texture_statistics__the_image_part_is_the_histogram_of_the_region(studi
     )
     # single precision
     np.testing.assert_allclose(found[0], quantile_function(want[:, 0]), atol=1e-4)
+
+
+def test_texture_statistics__histograms_are_numpys(studied):
+    """Of every part in double precision; single precision moves single texels."""
+    maps, texture = studied
+    log = np.log(maps["texel_diffuse_reflectance"].values[3].astype(np.float64))
+    images = (log - texture["texture_colour_mean"].values) @ texture[
+        "texture_colour_axis"
+    ].values.T
+    stored = texture["texture_histogram"].sel(region="beard").isel(take=3).values
+    for a in range(2):  # the third axis is only rounding
+        parts = image_parts(images[..., a])
+        fractions = level_fractions(BEARD, [part.shape for part in parts])
+        for p, (part, fraction) in enumerate(zip(parts, fractions, strict=True)):
+            inside = part[members(fraction)]
+            edges = texture["texture_edge"].values[a, p]
+            want = np.histogram(inside, edges)[0]
+            assert want.sum() == inside.size
+            moved = np.abs(stored[a, p] * inside.size - want).sum()
+            assert moved < 4 + 1e-3 * inside.size
 
 
 def test_texture_statistics__what_was_not_measured_does_not_count():

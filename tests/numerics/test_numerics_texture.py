@@ -8,12 +8,15 @@ from scipy.ndimage import gaussian_filter
 from skimage.exposure import match_histograms
 
 from skindb.numerics.texture import (
+    BINS,
     QUANTILES,
+    Bins,
     build,
+    common_bins,
     image_parts,
     level_fractions,
     members,
-    part_histogram,
+    part_members,
     part_names,
     part_quantiles,
     quantile_function,
@@ -29,7 +32,7 @@ SMALL = {"levels": 3, "orientations": 4}
 def quantiles_of(image, mask=None, **options):
     parts = image_parts(image, **(options or SMALL))
     mask = np.ones(image.shape) if mask is None else mask
-    return part_quantiles(parts, level_fractions(mask, [part.shape for part in parts]))
+    return part_quantiles(parts, part_members(mask, parts))
 
 
 def noise(shape=(64, 64), scale=1.0, seed=0):
@@ -56,15 +59,66 @@ def test_quantile_function__is_numpys(n):
     )
 
 
-def test_part_histogram__is_numpys():
-    part = noise((50, 40))
-    share = (np.random.default_rng(1).random((50, 40)) > 0.3).astype(float)
-    edges = np.linspace(-6, 6, 257)
-    want = np.histogram(part[share > 0.5], edges)[0] / (share > 0.5).sum()
-    np.testing.assert_allclose(part_histogram(part, share, edges), want, atol=1e-15)
-    # values beyond the ends are not lost
-    assert part_histogram(part + 100, share, edges)[-1] == 1
-    assert np.isnan(part_histogram(part, 0 * share, edges)).all()
+def test_part_members__are_those_of_the_fractions():
+    parts = image_parts(noise((63, 50)), **SMALL)
+    mask = noise((63, 50), seed=1) > 0
+    fractions = level_fractions(mask, [part.shape for part in parts])
+    for part, index, fraction in zip(
+        parts, part_members(mask, parts), fractions, strict=True
+    ):
+        np.testing.assert_array_equal(part.take(index), part[members(fraction)])
+
+
+def edges_of(exponent, first):
+    return (first + np.arange(BINS + 1)) * 2.0**exponent
+
+
+EXTREMES = [
+    noise((5000,)),
+    np.exp(noise((5000,))),
+    1e30 * noise((500,)),
+    1e-30 * noise((500,)),
+    1e6 + 1e-3 * noise((500,)),
+    np.full(3, -0.7),
+    np.zeros(4),
+]
+
+
+def test_bins__are_the_narrowest_and_those_of_numpy():
+    for values in EXTREMES:
+        values = values.astype(np.float32)
+        bins = Bins.of([values, values[:0], values[::2]])
+        edges = edges_of(bins.exponent, bins.first)
+        assert edges[0] <= values.min()
+        assert values.max() < edges[-1]
+        found = bins.merged(bins.exponent, bins.first)
+        for row, region in zip(found[[0, 2]], (values, values[::2]), strict=True):
+            np.testing.assert_array_equal(
+                row, np.histogram(region, edges)[0] / len(region)
+            )
+        assert np.isnan(found[1]).all()
+        width = 2.0**bins.exponent
+        if np.ptp(values) > 2.0**-20 * np.abs(values).max():
+            assert np.ptp(values) > (BINS / 2 - 1) * width
+
+
+def test_common_bins__merge_exactly():
+    """Fractions in the bins of all parts, whatever the ranges of the single ones."""
+    regions = [x.astype(np.float32) for x in (noise((999,)), 7 + noise((300,)) / 50)]
+    regions.append(np.full(5, 0.1, np.float32))
+    parts = [Bins.of([region]) for region in regions]
+    exponent, first = common_bins(parts)
+    edges = edges_of(exponent, first)
+    assert edges[0] <= np.concatenate(regions).min()
+    assert np.concatenate(regions).max() < edges[-1]
+    for part, region in zip(parts, regions, strict=True):
+        np.testing.assert_array_equal(
+            part.merged(exponent, first)[0],
+            np.histogram(region, edges)[0] / len(region),
+        )
+    assert exponent > parts[1].exponent
+    # half as wide would not contain all
+    assert edges[-1] - edges[0] < 4 * np.ptp(np.concatenate(regions))
 
 
 @pytest.mark.parametrize("shape", [(64, 64), (63, 50), (17, 128)])
