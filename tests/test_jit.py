@@ -208,13 +208,16 @@ print(len(calls), sum(len(part.signatures) for part in parts), len(kernels) > 50
 FIT = """
 import hashlib
 import numpy as np
-from skindb.reflectance.mixture import fit_reflectance
+from skindb.reflectance._mixture_kernels import Problem, fit_memory, fit_one
 rng, count, each = np.random.default_rng(0), 50, 60
 rows = rng.gamma(0.5, 1.0, (count * each, 16)).astype(np.float32)
 target, lift = rng.gamma(1.0, 1.0, (count * each, 3)), np.abs(rng.normal(size=(16, 59)))
-offsets = np.arange(0, count * each + 1, each)
-found = fit_reflectance(rows, offsets, target, None, lift, mode="perceptual", noise_floor=0.05)
-print(hashlib.sha256(found.parameters.tobytes()).hexdigest())
+found, work = np.zeros((count, 59)), fit_memory(each, 16, 59)
+ones = np.ones(each, np.float32)
+for x, m, r in zip(found, np.split(rows, count), np.split(target, count)):
+    r = np.ascontiguousarray(r.T, np.float32)
+    fit_one(Problem(m, r, ones, each, lift, True, 0.05, 1e-10), x, work)
+print(hashlib.sha256(found.tobytes()).hexdigest())
 """
 
 

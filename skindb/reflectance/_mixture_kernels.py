@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -17,21 +16,14 @@ from skindb.numerics._nnls_kernels import (
     solve_scaled,
 )
 from skindb.reflectance._lumitexel_kernels import (
-    FEW,
-    FITTED,
-    NOT_CONVERGED,
-    NOT_FINITE,
     RootMemory,
     inverse_root,
-    relative_errors,
     root_memory,
     slopes,
     to_roots,
 )
-from skindb.reflectance.model import SurfaceFit
 from skindb.types import (
     BoolVector,
-    IntVector,
     Matrix,
     Matrix32,
     Vector,
@@ -387,158 +379,6 @@ def _fit_roots(p: Problem, x: Vector, work: FitMemory) -> int:
         if gain < MIN_GAIN * (best + level):
             break
     return int(count)
-
-
-class Samples(NamedTuple):
-    """Rows and samples of many surfels, one after another."""
-
-    rows: Matrix32  # (total, r)
-    offsets: IntVector  # (surfels + 1,) first row of each surfel
-    target: Matrix  # (total, channels)
-    weight: Vector  # (total,)
-
-
-class Scaled(NamedTuple):
-    """Buffers for one surfel whose values are scaled to order one."""
-
-    rows: Matrix32  # (rows, width)
-    target: Matrix32  # (channels, rows)
-    weight: Vector32  # (rows,)
-    predicted: Matrix32  # (channels, rows)
-    lengths: Vector  # (r,) scale of each column
-
-
-@kernel
-def _power(value: float) -> float:
-    """Next power of two above |value|, 1 for zero; scaling by it is exact."""
-    return math.ldexp(1.0, math.frexp(value)[1]) if value > 0.0 else 1.0
-
-
-@kernel
-def _to_order_one(
-    rows: Matrix32, target: Matrix, weight: Vector, mixed: bool, scaled: Scaled
-) -> float:
-    """Write the rows, targets and weights of one surfel to `scaled`; returns the scale
-    of the targets.
-
-    All columns have the same scale if they are `mixed` by a lift.
-    """
-    lengths = scaled.lengths
-    for p in range(rows.shape[1]):
-        lengths[p] = np.abs(rows[:, p]).max()
-    if mixed:
-        lengths[:] = lengths.max()
-    for p in range(rows.shape[1]):
-        lengths[p] = _power(lengths[p])
-        for i in range(rows.shape[0]):
-            scaled.rows[i, p] = rows[i, p] / lengths[p]
-    scale = _power(np.abs(target).max())
-    heaviest = _power(weight.max())
-    for i in range(rows.shape[0]):
-        scaled.weight[i] = weight[i] / heaviest
-        for c in range(target.shape[1]):
-            scaled.target[c, i] = target[i, c] / scale
-    return scale
-
-
-@kernel
-def fit_many(
-    samples: Samples,
-    lift: Matrix,
-    perceptual: bool,
-    floor: float,
-    tolerance: float,
-    min_samples: int,
-    out: SurfaceFit,
-) -> None:
-    """Fit all surfels of a block; statuses are those of FitStatus."""
-    size = 1
-    for s in range(samples.offsets.shape[0] - 1):
-        size = max(size, samples.offsets[s + 1] - samples.offsets[s])
-    width = (lift.shape[0] + LANES - 1) // LANES * LANES
-    channels = samples.target.shape[1]
-    work = fit_memory(size, width, lift.shape[1])
-    scaled = Scaled(
-        np.zeros((size, width), np.float32),
-        np.empty((channels, size), np.float32),
-        np.empty(size, np.float32),
-        np.empty((channels, size), np.float32),
-        np.empty(lift.shape[0]),
-    )
-    problem = Problem(
-        scaled.rows,
-        scaled.target,
-        scaled.weight,
-        size,
-        lift,
-        perceptual,
-        floor,
-        tolerance,
-    )
-    for s in range(samples.offsets.shape[0] - 1):
-        lo = samples.offsets[s]
-        hi = samples.offsets[s + 1]
-        out.samples[s] = hi - lo
-        out.status[s] = FEW
-        if hi - lo >= min_samples:
-            out.status[s] = _fit_scaled(s, lo, hi, samples, problem, scaled, out, work)
-
-
-@kernel
-def _is_valid(rows: Matrix32, target: Matrix, weight: Vector) -> bool:
-    """Whether all numbers are finite and the weights not negative."""
-    finite = np.isfinite(rows).all() and np.isfinite(target).all()
-    return bool(finite and np.isfinite(weight).all() and weight.min() >= 0.0)
-
-
-@kernel
-def _fit_scaled(
-    s: int,
-    lo: int,
-    hi: int,
-    samples: Samples,
-    problem: Problem,
-    scaled: Scaled,
-    out: SurfaceFit,
-    work: FitMemory,
-) -> int:
-    """Fit surfel s, the rows from lo to hi, and return its status."""
-    n = hi - lo
-    rows = samples.rows[lo:hi]
-    target = samples.target[lo:hi]
-    weight = samples.weight[lo:hi]
-    if not _is_valid(rows, target, weight):
-        return NOT_FINITE
-    lift = problem.lift
-    square = lift.shape[0] == lift.shape[1]
-    scale = _to_order_one(rows, target, weight, not square, scaled)
-    floor = max(problem.floor / scale, MIN_NOISE_FLOOR)
-    x = out.parameters[s]
-    x[:] = 0.0
-    out.kkt[s], out.iterations[s], converged, out.condition[s] = fit_one(
-        Problem(
-            scaled.rows,
-            scaled.target,
-            scaled.weight,
-            n,
-            lift,
-            problem.perceptual,
-            floor,
-            problem.tolerance,
-        ),
-        x,
-        work,
-    )
-    predict(scaled.rows, n, coefficients(lift, x), work.predicted, work.single)
-    for c in range(scaled.target.shape[0]):
-        for i in range(n):
-            scaled.predicted[c, i] = work.predicted[i]
-    out.residual[s], out.residual_perceptual[s] = relative_errors(
-        scaled.predicted, scaled.target, n, floor
-    )
-    for j in range(x.shape[0]):
-        x[j] *= scale / (scaled.lengths[j] if square else scaled.lengths[0])
-    return FITTED if converged else NOT_CONVERGED
 
 
 @fast_kernel

@@ -6,14 +6,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
-from skindb.reflectance import _mixture_kernels, _row_kernels
+from skindb.reflectance import _row_kernels
 from skindb.reflectance._block_kernels import Tables, fit_block, judge_block
 from skindb.reflectance.block import (
     NO_TABLE,
@@ -64,7 +64,6 @@ DICTIONARY_VARIABLES = (  # in the order of `SurfaceFit`
     variables.FIT_STATUS,
 )
 MAX_LOG_SCALE = np.log(1e9)  # tables within this factor of 1 are used without scaling
-Mode = Literal["linear", "perceptual"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -382,75 +381,6 @@ def _above_horizon(normal: Array, away: Array) -> NDArray[np.bool_]:
     """(n, d) mask of directions above the horizon; false for NaN and infinite ones."""
     cosine = np.einsum("sc,sdc->sd", normal, away)
     return np.asarray(np.isfinite(cosine) & (cosine > 0))
-
-
-def fit_reflectance(
-    rows: NDArray[np.float32],
-    offsets: NDArray[np.int64],
-    target: Array,
-    weight: Array | None,
-    lift: Array,
-    *,
-    mode: Mode,
-    noise_floor: float,
-    min_samples: int = 10,
-    tolerance: float = 1e-10,
-) -> SurfaceFit:
-    """Fit weights x >= 0 of every surfel to all channels at once.
-
-    Parameters
-    ----------
-    rows
-        (total, r) basis rows in the reduced space, cosine included [sr^-1].
-    offsets
-        (n + 1,) index of the first row of each surfel, and the total.
-    target
-        (total, channels) samples minus the diffuse term [sr^-1]; negative values are
-        used unchanged.
-    weight
-        (total,) non-negative, or None for ones.
-    lift
-        (r, m): M = rows @ lift.
-    mode
-        "linear": min |M x - R|. "perceptual": min |root(M x) - root(R)| with root(y) =
-        y / (y^2 + floor^2)^(1/3), the signed cube root that is linear below the noise
-        floor, by Gauss-Newton with a line search; then one linear step weighted with
-        the squared slopes of the root, which is not biased by noise as the cube root
-        is.
-    noise_floor
-        [sr^-1], positive; not used by "linear".
-    min_samples
-        Surfels with fewer rows get status 2.
-    tolerance
-        Largest KKT residual.
-    """
-    if mode not in ("linear", "perceptual"):
-        raise ValueError(f"mode must be 'linear' or 'perceptual', not {mode!r}")
-    if not noise_floor > 0:
-        raise ValueError(f"noise_floor must be positive, not {noise_floor}")
-    out = empty_fit(len(offsets) - 1, lift.shape[1])
-    out.parameters[...] = 0.0
-    weights = np.ones(len(rows)) if weight is None else weight
-    samples = _mixture_kernels.Samples(
-        np.ascontiguousarray(rows),
-        np.asarray(offsets, np.int64),
-        np.ascontiguousarray(target, np.float64),
-        np.ascontiguousarray(weights, np.float64),
-    )
-    _mixture_kernels.fit_many(
-        samples,
-        np.ascontiguousarray(lift, np.float64),
-        mode == "perceptual",
-        float(noise_floor),
-        tolerance,
-        max(min_samples, 1),
-        out,
-    )
-    unfitted = (out.status == FitStatus.TOO_FEW_SAMPLES) | (
-        out.status == FitStatus.NOT_FINITE
-    )
-    out.parameters[unfitted] = np.nan
-    return out
 
 
 def _read_only(array: NDArray[Any]) -> NDArray[Any]:
