@@ -307,9 +307,6 @@ class IngestParameters(Limited):
         factor of sqrt 2.
     photographs
         Number of merged photographs kept for comparisons.
-    soft
-        Samples at the soft edges of shadows: excluded, or kept and divided by the
-        visible fraction of the light.
     calibration
         What to do with a capture whose photographs contradict its calibration: refuse
         it, or record a warning.
@@ -331,11 +328,6 @@ class IngestParameters(Limited):
         "Number of photographs kept for comparisons.",
         minimum=0,
         maximum=MAX_PHOTOGRAPHS,
-    )
-    soft: Literal["exclude", "keep"] = option(
-        "exclude",
-        "Treatment of samples at soft shadow edges: excluded, or divided by the "
-        "visible fraction of the light.",
     )
     calibration: Literal["refuse", "note"] = option(
         "refuse",

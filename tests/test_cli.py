@@ -316,7 +316,7 @@ def small_database(tmp_path_factory):
         "80",
     )
     assert made.returncode == 0, made.stderr
-    taken = _run("ingest", db, str(out / "c/V001"), "--spacing", "4", "--soft", "keep")
+    taken = _run("ingest", db, str(out / "c/V001"), "--spacing", "4")
     assert taken.returncode == 0
     assert re.search(
         r"samples per surfel: mean \d+ \(p5 \d+, .* of 64; \d+% of [\d,]+ surfels have any",

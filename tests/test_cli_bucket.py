@@ -27,7 +27,7 @@ def test_cli__all_steps_work_in_a_bucket(new_database, tmp_path, monkeypatch):
     monkeypatch.setenv("SKINDB_CACHE", str(own_cache(tmp_path / "cache")))
     size = ("--cameras", 4, "--lights", 16, "--width", 64, "--height", 80)
     _done("simulate", tmp_path / "c", "--takes", 1, *size)
-    _done("ingest", url, tmp_path / "c/V001", "--spacing", 8, "--soft", "keep")
+    _done("ingest", url, tmp_path / "c/V001", "--spacing", 8)
     assert not [
         path for path in skindb.open(url).scratch().rglob("*") if path.is_file()
     ]

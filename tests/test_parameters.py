@@ -110,7 +110,7 @@ def test_options_of__calls_with_the_record_or_with_what_was_given():
             r"position_error: must lie in \[0, 100\]",
         ),
         (DemoParameters, {"takes": 9}, r"takes: must lie in \[1, 8\]"),
-        (IngestParameters, {"soft": "guess"}, "must be one of exclude, keep"),
+        (IngestParameters, {"calibration": "guess"}, "must be one of refuse, note"),
         (SimulationParameters, {"width": 8}, r"width: must lie in \[16, 32768\]"),
     ],
 )

@@ -97,7 +97,6 @@ def _bilinear_bounds(
 def gather(
     view: MergedView,
     surfels: BoolVector,
-    light_fraction: Vector32,
     pixels: Matrix32,
     position: Matrix,
     normal: Matrix,
@@ -105,7 +104,7 @@ def gather(
     out: Halves,
     outcome: ByteVector,
 ) -> None:
-    """Reflectance rho = L d^2 / (I falloff fraction) of every surfel in one view
+    """Reflectance rho = L d^2 / (I falloff) of every surfel in one view
     (Weyrich et al. 2005, eq. 3).
 
     Parameters
@@ -114,9 +113,6 @@ def gather(
         Radiance, flags and usable exposures.
     surfels
         (n,) bool; those to sample. Those that face away from the light get no sample.
-    light_fraction
-        (n,) float32 visible fraction of the light's disc, 0 for no sample; or (0,) if
-        all of it is visible.
     pixels
         (n, 2) float32 projections.
     position, normal
@@ -135,13 +131,11 @@ def gather(
     out[:] = NAN_BITS
     outcome[:] = NONE
     for i in range(surfels.shape[0]):
-        if not surfels[i] or (light_fraction.shape[0] and light_fraction[i] <= 0):
+        if not surfels[i]:
             continue
         scale = _square_over_falloff(light, position[i], normal[i])
         if scale == 0.0:
             continue
-        if light_fraction.shape[0]:
-            scale /= light_fraction[i]
         state = _bilinear(view, pixels[i, 0], pixels[i, 1], pixel)
         outcome[i] = SINGLE if state == OK and pixel[4] < 2.0 else state
         if state == OK:

@@ -365,13 +365,12 @@ class _DomeStages:
         middle = surfels.position.mean(axis=0)
         return Sampler(
             check,
-            fully_lit(surfels, check.light_visible, cameras, soft=parameters.soft),
+            fully_lit(surfels, check.light_visible, cameras),
             mergers,
             self.spool,
             self.pool,
             self.run.report,
             kept=choose_photographs(self.dome, middle, parameters.photographs),
-            soft=parameters.soft == "keep",
         )
 
     def _labelled(

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from concurrent.futures import Executor, Future, wait
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +49,6 @@ T = TypeVar("T")
 R = TypeVar("R")
 # views that are requested ahead of the one that is waited for: keeps eight threads busy
 MAX_PENDING_VIEWS = 24
-PenumbraRule = Literal["exclude", "keep"]  # samples at the soft edges of shadows
 # visible fraction of a light's disc below which a surfel is in the penumbra
 MIN_LIT_FRACTION = 0.999
 FULL_SHADOW = 1e-3
@@ -110,24 +109,20 @@ def fully_lit(
     surfels: SurfelSet,
     light_fraction: NDArray[np.float16],
     cameras: Sequence[CameraRecord],
-    *,
-    soft: PenumbraRule = "exclude",
 ) -> Mask:
     """Where (n, light) the entire disc is visible from a surfel and from all neighbours
     that a pixel may cover.
 
     Pixels beside a shadow include a part of it: samples were measured 14 % too dark in
-    the first ring of neighbours. With `soft` "keep", any visible part of the disc is
-    enough, for a surfel and for its neighbours.
+    the first ring of neighbours.
     """
-    minimum = MIN_LIT_FRACTION if soft == "exclude" else FULL_SHADOW
     middle = surfels.position.mean(axis=0)
     pixel = max(camera.pixel_width(middle) for camera in cameras)
     rings = max(int(np.ceil(pixel / surfels.spacing())), 1)
     # the columns of lights are used one by one
     lit = np.empty_like(light_fraction, bool, order="F")
     for j in range(lit.shape[1]):
-        shadow = light_fraction[:, j] < minimum
+        shadow = light_fraction[:, j] < MIN_LIT_FRACTION
         for _ in range(rings):
             shadow = grown(surfels.faces, shadow)
         lit[:, j] = ~shadow
@@ -153,8 +148,6 @@ class Sampler:
         their total number.
     kept
         (light, camera) pairs whose merged radiance is kept.
-    soft
-        Whether samples are divided by the visible fraction of the light.
     faults
         Receives the faults of the views.
     """
@@ -166,7 +159,6 @@ class Sampler:
     pool: Executor
     progress: Progress = silent
     kept: Collection[Pair] = ()
-    soft: bool = False
     faults: list[Fault] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -313,13 +305,9 @@ class Sampler:
         light = check.dome.lights[j]
         out = np.empty((3, len(surfels)), np.uint16)
         outcome = np.empty(len(surfels), np.uint8)
-        light_fraction = np.zeros(0, np.float32)
-        if self.soft:
-            light_fraction = check.light_visible[:, j].astype(np.float32)
         gather(
             merged,
             surfels,
-            light_fraction,
             shot.pixels,
             check.surfels.position,
             check.surfels.normal,

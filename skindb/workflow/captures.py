@@ -94,8 +94,8 @@ def ingest_take(
     progress
         Called with the stage, the number of finished steps and the total number of steps.
     **parameters
-        Of `skindb.ingest.IngestParameters`: spacing_mm, photographs, soft,
-        calibration, refine.
+        Of `skindb.ingest.IngestParameters`: spacing_mm, photographs, calibration,
+        refine.
 
     Returns
     -------

@@ -262,7 +262,6 @@ def test_ingest_capture__provenance(take):
     assert attrs["parameters"] == {
         "spacing_mm": 4.0,
         "photographs": 2,
-        "soft": "exclude",
         "calibration": "refuse",
         "refine": "auto",
     }

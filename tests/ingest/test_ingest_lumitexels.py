@@ -133,7 +133,7 @@ def test_noise_floor__of_linear_files(surfels, capture):
     assert noise_floor(dome, np.tile(INTENSITY, (4, 1)), surfels) == LINEAR_NOISE_FLOOR
 
 
-def sampled(dome, surfels, folder, *, share=None, lit=None):
+def sampled(dome, surfels, folder, *, lit=None):
     """Every view of a dome, by rays that say what is clear; samples in memory."""
     mergers = {camera.id: frame_merger(dome, camera) for camera in dome.cameras}
     shape = (len(dome.lights), len(dome.cameras))
@@ -146,7 +146,7 @@ def sampled(dome, surfels, folder, *, share=None, lit=None):
         _, clear, pixels = camera_visibility(
             surfels, dome.cameras, RayScene(surfels.position, surfels.faces), pool
         )
-        soft = np.ones(lit.shape, np.float16) if share is None else share
+        soft = np.ones(lit.shape, np.float16)
         intensity = np.tile(INTENSITY, (shape[0], 1))
         check = CalibrationCheck(dome, surfels, soft, clear, pixels, intensity)
         sampler = Sampler(
@@ -155,21 +155,9 @@ def sampled(dome, surfels, folder, *, share=None, lit=None):
             mergers,
             spool,
             pool,
-            soft=share is not None,
         )
         found = sampler.lumitexels(check=False)
         return clear, replace(found, sample=found.sample.compute())
-
-
-def test_sampler__kept_soft_edges_are_divided_by_the_share(capture, surfels, tmp_path):
-    share = np.full((len(surfels.position), 4), 0.5, np.float16)
-    _, plain = sampled(capture.dome, surfels, tmp_path / "a")
-    _, soft = sampled(capture.dome, surfels, tmp_path / "b", share=share)
-    assert plain.counts[0].sum() > 1000
-    # two roundings
-    np.testing.assert_allclose(
-        soft.sample, 2 * plain.sample.astype(np.float64), rtol=2**-10
-    )
 
 
 def test_describe_samples__one_camera_one_light_and_none(capture, surfels, tmp_path):
@@ -251,15 +239,6 @@ def test_sampler__counts_what_is_lost(capture_folder, tmp_path):
     np.testing.assert_array_equal(
         found.counts[0], np.isfinite(store).all(-1).sum((1, 2))
     )
-
-
-def test_fully_lit__keeps_soft_edges_but_not_full_shadow(surfels, capture):
-    share = np.ones((len(surfels.position), 2), np.float16)
-    share[100, 0], share[100, 1] = 0.4, 0
-    lit = fully_lit(surfels, share, capture.dome.cameras, soft="keep")
-    assert lit[:, 0].all()
-    ring = set(surfels.faces[(surfels.faces == 100).any(axis=1)].ravel())
-    assert set(np.flatnonzero(~lit[:, 1])) == ring
 
 
 def test_cleaning_lines__with_places_say_where():

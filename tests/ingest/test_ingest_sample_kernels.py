@@ -26,7 +26,6 @@ def sampled(
     flag,
     pixels,
     *,
-    share=None,
     falloff=0.0,
     wanted=None,
     far=None,
@@ -44,7 +43,6 @@ def sampled(
             np.full_like(flag, 2) if usable is None else usable,
         ),
         np.ones(n, bool) if wanted is None else wanted,
-        np.zeros(0, np.float32) if share is None else share,
         np.asarray(pixels, np.float32),
         position,
         np.tile([0.0, 0, 1], (n, 1)),
@@ -99,27 +97,25 @@ def test_gather__a_constant_stays():
     )
 
 
-def test_gather__light_share_falloff_and_what_is_not_wanted():
+def test_gather__falloff_and_what_is_not_wanted():
     image = np.ones((8, 8, 3))
     flag = np.zeros((8, 8), np.uint8)
     n = 5
     # the third is behind the light
     far = np.array([[0, 0, 0], [40, 5, 3], [0, 0, 400], [1, 1, 1], [2, 2, 2.0]])
-    share = np.array([0.5, 1, 1, 0, 1], np.float32)
     wanted = np.array([True, True, True, True, False])
     got, outcome = sampled(
         image,
         flag,
         np.full((n, 2), 4.0),
-        share=share,
         falloff=3.0,
         wanted=wanted,
         far=far,
     )
-    assert outcome.tolist() == [OK, OK, NONE, NONE, NONE]
+    assert outcome.tolist() == [OK, OK, NONE, OK, NONE]
     way = far - LIGHT
     cosine = way @ AXIS / np.linalg.norm(way, axis=1)
-    want = factor(far) / cosine[:, None] ** 3 / share[:, None].clip(0.1)
+    want = factor(far) / cosine[:, None] ** 3
     np.testing.assert_allclose(got[:2], want[:2], rtol=2**-11 * 1.01)
 
 
