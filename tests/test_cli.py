@@ -28,7 +28,7 @@ from skindb.errors import Fault
 from skindb.render.image import read_exr, read_png
 
 COMMANDS = (
-    "demo simulate calibrate capture landmarks ingest fit dictionary analyze "
+    "demo simulate calibrate capture landmarks quick import ingest fit dictionary analyze "
     "register edit render compare show export "
     "view consent release refresh withdraw info audit verify clean bench"
 ).split()

@@ -7,6 +7,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from skindb.calibration._merge_kernels import OK
 from skindb.calibration.frame_checks import checked_view
@@ -25,6 +26,8 @@ MIN_TARGET_PIXELS = 12
 MIN_COSINE_TARGET = 0.05
 # neighbouring pixels that are averaged before their spread is measured
 PIXELS_PER_GROUP = 16
+# R_d that a pixel at the white level shows if no intensity is known
+RELATIVE_WHITE = 0.5
 # relative spread of the intensity over the target: 0.02 in captures, 0.35 and more if a
 # face stands in its place
 MAX_UNEVENNESS = 0.2
@@ -55,9 +58,12 @@ def light_intensities(
     mergers: Mapping[str, FrameMerger],
     pool: Executor,
     digests: Digests | None = None,
+    *,
+    centre: ArrayLike = (0.0, 0.0, 0.0),
 ) -> Float64:
     """Radiant intensity (light, 3) in radiance mm2: given, or I = pi L d^2 /
-    (reflectance cos falloff) by the target.
+    (reflectance cos falloff) by the target; without both, the same for all lights, see
+    `relative_intensity`.
 
     Raises
     ------
@@ -75,6 +81,8 @@ def light_intensities(
     def intensity(light: LightRecord) -> Float64:
         if light.intensity is not None:
             return light.intensity
+        if white is None:
+            return relative_intensity(dome, np.asarray(centre, np.float64))
         values = [np.zeros((0, 3))]
         for target in targets:
             merger = mergers[target.camera]
@@ -90,6 +98,21 @@ def light_intensities(
         return mean
 
     return np.array(attempt_all([], intensity, dome.lights, pool=pool))
+
+
+def relative_intensity(dome: DomeRecord, centre: Float64) -> Float64:
+    """Intensity (3,) of every light where none is known.
+
+    The median light makes a matt surface of R_d 0.5 at `centre` that faces it as bright
+    as the white level of the longest exposure, or radiance 1 of linear files. So
+    reflectance is relative, but the same in all captures of a dome with these exposures.
+    """
+    levels = [
+        1.0 if camera.sensor.kind.bits == 0 else 1 / max(dome.exposures.values())
+        for camera in dome.cameras
+    ]
+    square = np.median([light_falloff(x, centre[None])[0] for x in dome.lights])
+    return np.full(3, np.pi / RELATIVE_WHITE * max(levels) * float(square))
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ import click
 import skindb
 from skindb.cli.captures import demo, ingest, simulate
 from skindb.cli.fitting import dictionary_command, fit
+from skindb.cli.imports import import_command, quick
 from skindb.cli.laboratory import calibrate, capture, landmarks
 from skindb.cli.pictures import compare, export, render, show, view
 from skindb.cli.population import edit, register
@@ -44,6 +45,8 @@ for _command in (
     calibrate,
     capture,
     landmarks,
+    quick,
+    import_command,
     ingest,
     fit,
     dictionary_command,

@@ -38,6 +38,8 @@ from skindb.types import Float64, Index
 
 ROTATION_TOLERANCE = 1e-4  # of R R^T - 1: five digits in the file
 MAX_DISC_RADIUS_MM = 2_000.0  # mm: the largest soft boxes have a radius of 1 m
+# mm; a light of which the direction alone is known is placed there: 0.1 degrees over a face
+DISTANT_MM = 9e4
 # exponent of the cosine: a narrow spot, half as bright at 1.5 degrees from the axis
 MAX_FALLOFF = 2_000.0
 TARGET_HALF_SIZES_MM = (1.0, 2_000.0)  # mm: from a patch of a colour chart to a wall
@@ -148,6 +150,8 @@ class DomeRecord:
     white: WhiteRecord | None
     file: Path = Path("dome.json")
     sequence: SequenceRecord | None = None
+    # intensities are known up to a common factor for each channel
+    relative: bool = False
 
     @property
     def frame_count(self) -> int:
@@ -200,14 +204,18 @@ def read_dome(
     lights = tuple(_light(item) for item in fields.items("lights", maximum=MAX_LIGHTS))
     dark = fields.template("dark", {CAMERA} | several, {EXPOSURE}, default=None)
     white = None
+    unknown = [light.id for light in lights if light.intensity is None]
+    relative = fields.get("relative", False)
+    if not isinstance(relative, bool):
+        fields.fault("relative", "must be true or false", shown(relative))
     if target is not None:
         white = _white(fields.object("white"), {c.id for c in cameras}, several)
-    elif not calibrated:
-        unknown = [light.id for light in lights if light.intensity is None]
-        if unknown:
-            rule = "lights need an intensity or a white target"
+    elif not calibrated and unknown:
+        if len(unknown) < len(lights):
+            rule = "all lights need an intensity, or a white target, or none has one"
             finding = f"{len(unknown)} lights without intensity, first {unknown[0]}"
             fields.fault("white", rule, finding, "measure one of them")
+        relative = True
     # version 1 keeps the sequence as an unchecked attribute
     sequence = None
     if version > 1 and fields.has("sequence"):
@@ -222,6 +230,7 @@ def read_dome(
         white,
         Path(fields.where),
         sequence,
+        relative and white is None,
     )
     _check_frames(dome, fields)
     return dome
@@ -324,7 +333,15 @@ def _light(item: Fields) -> LightRecord:
     intensity = item.array("intensity", (3,)) if item.has("intensity") else None
     if intensity is not None and (intensity <= 0).any():
         item.fault("intensity", "must be positive", shown(intensity))
-    position = item.array("position", (3,))
+    if item.has("direction"):
+        if item.has("position"):
+            rule = "a light has a position or a direction"
+            item.fault("direction", rule, "both", "remove the direction")
+        position = DISTANT_MM * _direction(item, "direction")
+        # given as irradiance of a surface that faces the light
+        intensity = None if intensity is None else DISTANT_MM**2 * intensity
+    else:
+        position = item.array("position", (3,))
     return LightRecord(
         id=item.text("id", rule=IDENTIFIER),
         position=position,

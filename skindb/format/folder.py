@@ -62,11 +62,14 @@ Point = Float64  # (3,) mm
 FORMAT = "skindb-capture"
 VERSIONS = (1, 2)
 OVERRIDE = ("screened", "consented", "eyes_closed")  # what the operator confirms
-# degrees; larger ones than the maximum cannot be told apart
+# degrees; larger ones than the maximum cannot be distinguished
 MIN_SCAN_ERROR = 0.1
 MAX_SCAN_ERROR = 90.0
 SCOPES = ("fit", "statistics", "export", "publish")
 WHOLE_SURFACE = "all"  # name of the entire surface in reports by region
+_NONE = np.zeros(0, np.int64)
+NO_SCAN = Scan(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+NO_SURFACE = CleanMesh(NO_SCAN.vertices, NO_SCAN.faces, _NONE, _NONE, {}, {})
 SIMULATED = ("virtual", "seed", "rehearsal")  # attributes of virtual captures
 
 
@@ -87,7 +90,8 @@ class Capture:
     scan_error: float  # RMS angle of the scan's normals to the true ones [degree]
     # confirmation of flashes above the limit for photosensitive seizures; may be empty
     override: Mapping[str, Any]
-    mesh_file: Path
+    mesh_file: Path | None
+    # without vertices if there is no scan: ingest makes them from the photographs
     scan: Scan
     surface: CleanMesh
     landmarks: Mapping[str, Point]
@@ -102,6 +106,11 @@ class Capture:
     crop: Crop | None = None  # limits of the scan
     # version of the calibration that provides its lights
     calibrated_by: Mapping[str, Any] | None = None
+
+    @property
+    def has_scan(self) -> bool:
+        """Whether the surface was scanned; otherwise ingest estimates it."""
+        return self.mesh_file is not None
 
     @property
     def take(self) -> str:
@@ -188,7 +197,7 @@ class _Reader:
     def capture(self) -> Capture | None:
         fields = self.fields
         person = self.person()
-        mesh_file = self._path("mesh")
+        mesh_file = self._path("mesh") if fields.has("mesh") else None
         self.mesh_place = f"{mesh_file} (mesh)"
         scan, surface = self._mesh(mesh_file)
         landmarks = self._landmarks(scan, surface)
@@ -201,7 +210,10 @@ class _Reader:
         if self.unit_faults and scan is not None:
             lengths = Lengths(scan, landmarks, _middles(scan, regions), self.dome)
             self.faults += self._joint_unit_fault(lengths) or self.unit_faults
-        if mesh_file is None or scan is None or surface is None:
+        if not fields.has("mesh"):
+            self._require_one_camera()
+            scan, surface = NO_SCAN, NO_SURFACE
+        if scan is None or surface is None:
             return None
         self.crop = self.crop or self._saved_crop()
         surface = self._cropped(scan, surface, landmarks)
@@ -360,6 +372,21 @@ class _Reader:
         self.unit_faults += scan_faults(self.mesh_place, surface)
         return scan, surface
 
+    def _require_one_camera(self) -> None:
+        """Without a scan, the surface is estimated from the photographs of one camera."""
+        cameras = 0 if self.dome is None else len(self.dome.cameras)
+        if cameras != 1 and not self.faults:
+            rule = "a capture needs a scan, unless one camera photographed the face"
+            cure = (
+                "scan the face, or reconstruct it from the photographs of all cameras with "
+                "a program for photogrammetry such as COLMAP or Meshroom; or keep one camera"
+            )
+            self.fields.fault("mesh", rule, f"no scan, {cameras} cameras", cure)
+        self.skipped.append(
+            "mesh: not in capture.json; the surface is estimated from the shading, and its "
+            "normals are no prior"
+        )
+
     def _saved_crop(self) -> Crop | None:
         """The box in the file beside the landmarks, if there is one."""
         name = self.fields.get("landmarks", None)
@@ -386,7 +413,7 @@ class _Reader:
         self, scan: Scan, surface: CleanMesh, landmarks: Mapping[str, Point]
     ) -> CleanMesh:
         """The part of the scan inside the crop, cleaned."""
-        if self.crop is None:
+        if self.crop is None or not len(scan.vertices):
             return surface
         if self.crop.reach_mm is not None and not landmarks:
             rule = "a crop around the landmarks needs landmarks"
@@ -527,9 +554,12 @@ class _Reader:
         calibrated = self._has_in_version_2("calibration")
         dome = read_dome(self.folder, fields, self.version, calibrated=calibrated)
         if dome.white is None:
-            self.skipped.append(
-                "white: not in dome.json; intensities of the lights are taken as given"
+            meaning = (
+                "R_d is relative to an unknown factor per channel"
+                if dome.relative
+                else "intensities of the lights are taken as given"
             )
+            self.skipped.append(f"white: not in dome.json; {meaning}")
         if surface is None or self.unit_faults:
             return dome
         file = fields.where

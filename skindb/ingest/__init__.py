@@ -3,6 +3,7 @@
 from skindb.format.folder import Capture, read_capture
 from skindb.geometry.scan import Crop
 from skindb.ingest.capture import ingest_capture, scratch_name
+from skindb.ingest.pictures import import_images, import_olat
 from skindb.ingest.report import (
     calibration_lines,
     calibration_table,
@@ -19,6 +20,8 @@ __all__ = [
     "calibration_lines",
     "calibration_table",
     "cleaning_lines",
+    "import_images",
+    "import_olat",
     "ingest_capture",
     "read_capture",
     "sample_lines",

@@ -63,6 +63,7 @@ from skindb.ingest.refinement import (
     reason_to_skip,
     refine_cameras,
 )
+from skindb.ingest.relief import NO_SCAN_DEGREES, Relief, estimate_relief
 from skindb.ingest.report import (
     capture_provenance,
     describe_samples,
@@ -131,9 +132,15 @@ def ingest_capture(
     parameters = parameters or IngestParameters()
     require_fit_consent(capture)
     report("check", 1, 1)
-    surfels = build_surfels(capture, spacing_mm=parameters.spacing_mm)
+    relief = None
+    if not capture.has_scan:
+        capture, relief = _with_relief(capture, parameters.spacing_mm)
+        report("relief", 1, 1)
+    surfels = build_surfels(
+        capture, spacing_mm=parameters.spacing_mm, planar=relief is not None
+    )
     report("surfels", 1, 1)
-    run = _Run(capture, surfels, parameters, report)
+    run = _Run(capture, surfels, parameters, report, relief)
     run.groups |= {"mesh": mesh_group(capture, surfels), "atlas": atlas_group(surfels)}
     with ExitStack() as stack:
         if capture.dome is None:
@@ -154,6 +161,25 @@ def ingest_capture(
         yield tree
 
 
+def _with_relief(capture: Capture, spacing_mm: float) -> tuple[Capture, Relief]:
+    """The capture with the surface that its photographs show."""
+    dome = capture.dome
+    assert dome is not None  # as there is no scan
+    faults = list[Fault]()
+    mergers = frame_mergers(dome, faults)
+    if faults:
+        raise InputError(grouped(faults))
+    with ThreadPoolExecutor(threads(dome)) as pool:
+        relief = estimate_relief(dome, mergers, pool, spacing_mm=spacing_mm)
+    scanned = replace(
+        capture,
+        scan=relief.scan,
+        surface=relief.surface,
+        scan_error=NO_SCAN_DEGREES,
+    )
+    return scanned, relief
+
+
 @dataclass
 class _Run:
     """An ingest, and what its stages have produced so far."""
@@ -162,6 +188,7 @@ class _Run:
     surfels: SurfelSet
     parameters: IngestParameters
     report: Progress
+    relief: Relief | None = None
     groups: dict[str, xr.Dataset] = field(default_factory=dict)
     faults: list[Fault] = field(default_factory=list)
     digests: Digests = field(default_factory=Digests)
@@ -282,16 +309,29 @@ class _DomeStages:
         # otherwise samples are those of other intensities, dark frames and cameras
         self.spool.resumable = not self.run.faults
         scene = RayScene(surfels.position, surfels.faces)
-        light_fraction = light_visibility(surfels, self.dome.lights, scene, self.pool)
+        relief = self.run.relief
+        if relief is None:
+            light_fraction = light_visibility(
+                surfels, self.dome.lights, scene, self.pool
+            )
+        else:
+            light_fraction = relief.light_fraction(
+                self.dome.cameras[0], surfels.position
+            )
         sees = partial(camera_visibility, surfels, scene=scene, pool=self.pool)
         visible, clear, pixels = sees(self.dome.cameras)
+        if relief is not None:
+            # every point was made from pixels that show it
+            visible, clear = np.ones_like(visible), np.ones_like(clear)
         self.run.report("visibility", 1, 1)
         check = CalibrationCheck(
             self.dome, surfels, light_fraction, clear, pixels, intensity
         )
         sampler = self._sampler(mergers, check)
         rotations = np.zeros((len(self.dome.cameras), 3))
-        if parameters.refine is not False and not self.run.faults:
+        # a surface made from the photographs cannot contradict them
+        checked = relief is None
+        if checked and parameters.refine is not False and not self.run.faults:
             refined = self._refined(sampler)
             if refined is not self.dome:
                 rotations = applied_rotations(self.dome, refined)
@@ -305,7 +345,8 @@ class _DomeStages:
         lumitexels = attempt(
             self.run.faults,
             lambda: sampler.lumitexels(
-                check=not self.run.faults, refuse=parameters.calibration == "refuse"
+                check=checked and not self.run.faults,
+                refuse=parameters.calibration == "refuse",
             ),
         )
         if lumitexels is None:
@@ -429,7 +470,13 @@ class _DomeStages:
         """
         intensity = attempt(
             self.run.faults,
-            lambda: light_intensities(self.dome, mergers, self.pool, self.run.digests),
+            lambda: light_intensities(
+                self.dome,
+                mergers,
+                self.pool,
+                self.run.digests,
+                centre=self.run.surfels.position.mean(axis=0),
+            ),
         )
         self.run.report("lights", 1, 1)
         if intensity is None:

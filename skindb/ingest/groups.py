@@ -102,6 +102,7 @@ def dome_group(dome: DomeRecord, intensity: Float64) -> xr.Dataset:
         "light_disc_radius": [light.disc_radius for light in lights],
         "light_falloff": [light.falloff for light in lights],
         "light_intensity": intensity,
+        "relative_reflectance": int(dome.relative),
         "camera_position": [camera.centre for camera in cameras],
         "camera_matrix": [camera.K for camera in cameras],
         "camera_rotation": [camera.R for camera in cameras],

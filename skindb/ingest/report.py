@@ -110,8 +110,8 @@ def _files(capture: Capture) -> list[Path]:
     """All files of a capture except frames."""
     cameras = () if capture.dome is None else capture.dome.cameras
     tables = {camera.sensor.response_file for camera in cameras}
-    files = [*capture.json_files, capture.mesh_file]
-    return files + sorted(file for file in tables if file is not None)
+    files = {capture.mesh_file, *tables} - {None}
+    return [*capture.json_files, *sorted(file for file in files if file is not None)]
 
 
 def _all_parameters(capture: Capture, parameters: Mapping[str, Any]) -> dict[str, Any]:

@@ -62,7 +62,8 @@ class SurfelSet:
     faces: Index  # (f, 3)
     region_names: tuple[str, ...]
     region: Mask  # (n, region)
-    uv_weights: str  # weights that uv were computed with: "intrinsic" or "mean_value"
+    # weights that uv were computed with: "intrinsic" or "mean_value"; or "planar"
+    uv_weights: str
 
     def cosine(self, camera: CameraRecord, part: slice = slice(None)) -> Float64:
         """Cosine (n,) between normals and the direction to the camera."""
@@ -80,14 +81,24 @@ def lattice_spacing(area: float) -> float:
     return float(np.sqrt(2 / np.sqrt(3) * area))
 
 
-def build_surfels(capture: Capture, *, spacing_mm: float) -> SurfelSet:
+def build_surfels(
+    capture: Capture, *, spacing_mm: float, planar: bool = False
+) -> SurfelSet:
     """Surfels about `spacing_mm` apart, within a factor of sqrt 2, as each level of
     subdivision halves the spacing.
+
+    `planar` surfels are the vertices of the mesh, and their texture coordinates those of
+    the picture.
     """
     mesh = capture.surface
-    levels = subdivision_levels(mesh, spacing_mm)
+    levels = 0 if planar else subdivision_levels(mesh, spacing_mm)
     vertices, faces, matrix = subdivide(mesh.vertices, mesh.faces, levels)
-    uv, atlas = disc_atlas(mesh.vertices, mesh.faces, finer=(matrix, faces))
+    weights = "planar"
+    if planar:
+        uv = _planar_uv(vertices)
+    else:
+        uv, atlas = disc_atlas(mesh.vertices, mesh.faces, finer=(matrix, faces))
+        weights = "intrinsic" if atlas["intrinsic"] else "mean_value"
     order = morton_order(vertices)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
@@ -100,8 +111,16 @@ def build_surfels(capture: Capture, *, spacing_mm: float) -> SurfelSet:
         faces=rank[faces],
         region_names=names,
         region=np.asarray(matrix @ member)[order] > 0.5,
-        uv_weights="intrinsic" if atlas["intrinsic"] else "mean_value",
+        uv_weights=weights,
     )
+
+
+def _planar_uv(vertices: Float64) -> NDArray[np.float32]:
+    """Texture coordinates (n, 2) by x and y, v = 0 at the top; equal scales in both."""
+    low = vertices[:, :2].min(axis=0)
+    size = float(np.ptp(vertices[:, :2], axis=0).max()) or 1.0
+    u, v = ((vertices[:, :2] - low) / size).T
+    return np.stack([u, 1 - v], axis=1).astype(np.float32)
 
 
 def subdivision_levels(mesh: CleanMesh, spacing_mm: float) -> int:

@@ -42,6 +42,7 @@ from .pictures import (
     view_server,
     view_takes,
 )
+from .quick import quick
 from .session import capture_session, plan_session
 from .simulation import begin_cohort, simulate, simulate_one
 from .studies import STUDY_FUNCTIONS, study
@@ -95,6 +96,7 @@ __all__ = [
     "plan_session",
     "plan_take",
     "plan_withdrawal",
+    "quick",
     "record_consent",
     "refresh",
     "register_takes",

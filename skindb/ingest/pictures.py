@@ -1,0 +1,777 @@
+"""Capture folders from what people have: a folder of pictures with directions of the
+lights, or light-stage folders with one picture for each light and camera.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import imagecodecs
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageOps, UnidentifiedImageError
+from scipy.spatial.transform import Rotation
+
+from skindb.calibration.lights import ball_outline, distant_light, highlight_centre
+from skindb.errors import Fault, InputError, attempt, input_error, require
+from skindb.files import private_file, private_umask, read_regular
+from skindb.format.fields import IDENTIFIER, Fields, read_json, short
+from skindb.format.folder import FORMAT, record_faults
+from skindb.format.frames import read_frame, write_frame
+from skindb.limits import (
+    MAX_CAMERAS,
+    MAX_FRAME_BYTES,
+    MAX_FRAME_PIXELS,
+    MAX_LIGHTS,
+    MAX_SCAN_BYTES,
+)
+from skindb.types import Float64, Mask, Progress, silent
+
+Picture = NDArray[Any]  # (h, w, 3) uint8, uint16, or float radiance
+Response = Literal["auto", "srgb", "linear"]
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".exr")
+FORMATS = "PNG, TIFF, JPEG, BMP or OpenEXR"
+CAMERA = "c00"
+# mm; distance of a camera whose lens is not known: perspective is below a hundredth
+CAMERA_DISTANCE_MM = 10_000.0
+# R_d of a facing surface that is as bright as the white level
+WHITE_REFLECTANCE = 0.5
+# of the radiances of linear files, which takes the place of the white level
+BRIGHT_QUANTILE = 0.999
+MAX_TABLE_BYTES = 4 << 20
+COLUMNS = ("x", "y", "z")
+# of a file of lights; positions are in mm
+POSITION_COLUMNS = ("x_mm", "y_mm", "z_mm")
+PATTERNS = (
+    "{camera}/{light}",
+    "{light}/{camera}",
+    "{camera}_{light}",
+    "{light}_{camera}",
+)
+
+
+@dataclass(frozen=True)
+class Light:
+    """A light of a table: the picture it belongs to, and where it is."""
+
+    name: str
+    vector: Float64  # (3,) direction, or position in mm
+    distant: bool
+    gain: float = 1.0  # relative intensity
+
+
+@dataclass(frozen=True)
+class Imported:
+    """What an import wrote and assumed."""
+
+    folder: Path
+    lights: int
+    cameras: int
+    notes: tuple[str, ...]
+
+
+def import_images(
+    source: str | Path,
+    out: str | Path,
+    person: Mapping[str, Any],
+    *,
+    lights: str | Path | None = None,
+    mirror_ball: str | Path | None = None,
+    mask: str | Path | None = None,
+    response: Response = "auto",
+    width_mm: float | None = None,
+    progress: Progress = silent,
+) -> Imported:
+    """Write a capture folder from pictures of one camera, each under one light.
+
+    Parameters
+    ----------
+    source
+        Folder of the pictures: PNG, TIFF, JPEG, BMP or OpenEXR, all of one size.
+    out
+        Capture folder to write, which must not exist.
+    person
+        `subject`, `consent` and optional keys of capture.json, such as `condition`.
+    lights
+        Table of the lights (CSV or RTI .lp): a line for each picture with its file name
+        and the direction to the light, x to the right of the picture, y up, z to the
+        camera; or columns x_mm, y_mm, z_mm of positions. Default: lights.csv or the only
+        .lp file in the folder.
+    mirror_ball
+        Folder of pictures of a mirror ball under the same lights, in the same order, and
+        one picture `*mask*` of its disc; instead of `lights`.
+    mask
+        Picture that is bright on the subject; default: the picture `*mask*` in the folder,
+        if there is one.
+    response
+        "srgb" or "linear" values; "auto" takes pictures of 8 bits as sRGB.
+    width_mm
+        Width of the picture on the subject; default: 250 for the longer side.
+    progress
+        Callback.
+
+    Returns
+    -------
+    Imported
+        The folder, and what was assumed.
+
+    Raises
+    ------
+    InputError
+        With every picture that is absent, unreadable or of another size, or a table or
+        record with faults.
+    """
+    source, out = Path(source), Path(out)
+    _require_writable(out, person)
+    files = _pictures(source)
+    masks = [file for file in files if "mask" in file.stem.lower()]
+    files = [file for file in files if file not in masks]
+    notes = []
+    if mirror_ball is not None:
+        table = _from_ball(Path(mirror_ball), files)
+        notes.append(f"{len(table)} directions of lights from the mirror ball")
+    else:
+        table = read_lights(_table_file(source, lights))
+    chosen = _matched(source, files, table)
+    frames = _Frames(out, chosen[0], response)
+    height, width = frames.size
+    inside = _mask(Path(mask) if mask else _only(masks), frames.size)
+    if width_mm is None:
+        width_mm = 250.0 * width / max(width, height)
+        notes.append(
+            f"the picture is taken as {width_mm:.0f} mm wide on the subject; --width states it"
+        )
+    if unused := len(files) - len(chosen):
+        notes.append(f"{unused} pictures have no light and are not used")
+    ids = _ids([light.name for light in table])
+    camera = _distant_camera(width, height, width_mm)
+    for k, (file, name) in enumerate(zip(chosen, ids, strict=True)):
+        frames.add(file, name, camera, inside)
+        progress("import", k + 1, len(chosen))
+    frames.finish(person, [camera], table, ids)
+    return Imported(out, len(chosen), 1, (*notes, *frames.notes))
+
+
+def import_olat(
+    source: str | Path,
+    out: str | Path,
+    person: Mapping[str, Any],
+    *,
+    lights: str | Path | None = None,
+    cameras: str | Path | None = None,
+    mesh: str | Path | None = None,
+    response: Response = "auto",
+    progress: Progress = silent,
+) -> Imported:
+    """Write a capture folder from a light stage: one picture for each light and camera.
+
+    Parameters
+    ----------
+    source
+        Folder with the pictures as CAMERA/LIGHT, LIGHT/CAMERA, CAMERA_LIGHT or
+        LIGHT_CAMERA with any suffix of a picture.
+    out, person, response, progress
+        As in `import_images`.
+    lights
+        Table of the lights as in `import_images`, in the frame of the cameras; names are
+        those in the pictures. Default: lights.csv in the folder.
+    cameras
+        JSON with a list of `id, K, R, t` and optional `width, height, distortion`, as in
+        dome.json, or a folder with cameras.txt and images.txt of COLMAP, whose images
+        are named after the cameras. Default: cameras.json, or the folder itself.
+    mesh
+        Scan in mm, PLY or OBJ; default: the only one in the folder. One camera needs none.
+
+    Returns
+    -------
+    Imported
+        The folder, and what was assumed.
+
+    Raises
+    ------
+    InputError
+        With every picture that is absent, unreadable or of another size than its camera.
+    """
+    source, out = Path(source), Path(out)
+    _require_writable(out, person)
+    table = read_lights(_table_file(source, lights))
+    devices = _read_cameras(source, Path(cameras) if cameras else None)
+    names = [light.name for light in table]
+    pattern, files = _olat_files(source, names, [str(c["id"]) for c in devices])
+    frames = _Frames(out, next(iter(files.values())), response)
+    ids = _ids(names)
+    light_ids = dict(zip(names, ids, strict=True))
+    camera_ids = _ids([str(c["id"]) for c in devices])
+    by_name = {str(device["id"]): device for device in devices}
+    for device, name in zip(devices, camera_ids, strict=True):
+        device["id"] = name
+    for k, ((light, camera), file) in enumerate(files.items()):
+        frames.add(file, light_ids[light], by_name[camera])
+        progress("import", k + 1, len(files))
+    meshes = sorted([*source.glob("*.ply"), *source.glob("*.obj")])
+    frames.finish(person, devices, table, ids, Path(mesh) if mesh else _only(meshes))
+    notes = (f"pictures are {pattern}{frames.first.suffix}", *frames.notes)
+    return Imported(out, len(table), len(devices), notes)
+
+
+class _Frames:
+    """The frames of a capture folder that is written from pictures."""
+
+    def __init__(self, out: Path, first: Path, response: Response) -> None:
+        picture = read_picture(first)
+        self.out = out
+        self.first = first
+        self.size = picture.shape[:2]
+        self.dtype = picture.dtype
+        self.linear = picture.dtype.kind == "f"
+        eight = picture.dtype == np.uint8
+        automatic = response == "auto" and eight
+        self.srgb = automatic or (response == "srgb" and not self.linear)
+        self.suffix = ".exr" if self.linear else ".png"
+        self.levels = list[float]()
+        self.faults = list[Fault]()
+        self.newest = 0.0  # time of the newest picture
+        self.notes = [
+            "pictures of 8 bits are taken as sRGB; --response linear if they are not"
+        ] * automatic
+
+    def add(
+        self,
+        file: Path,
+        light: str,
+        camera: dict[str, Any],
+        inside: Mask | None = None,
+    ) -> None:
+        """Write a frame, black outside a mask; the first frame of a camera determines
+        its size.
+        """
+        picture = attempt(self.faults, partial(read_picture, file))
+        if picture is None:
+            return
+        height, width, _ = picture.shape
+        wanted = (
+            camera.setdefault("width", width),
+            camera.setdefault("height", height),
+        )
+        found = f"{width} x {height} of {picture.dtype}"
+        exact = picture.dtype == self.dtype or (
+            self.linear and picture.dtype.kind == "f"
+        )
+        if wanted != (width, height) or not exact:
+            rule = "all pictures must be {} x {} of {}".format(*wanted, self.dtype)
+            cure = "export it like the others"
+            self.faults.append(Fault(str(file), rule, found, cure))
+            return
+        if inside is not None:
+            picture[~inside] = 0
+        if self.linear:
+            used = picture if inside is None else picture[inside]
+            self.levels.append(float(np.quantile(used, BRIGHT_QUANTILE)))
+        target = self.out / f"dome/frames/{light}_{camera['id']}{self.suffix}"
+        with private_umask():
+            target.parent.mkdir(parents=True, exist_ok=True)
+        write_frame(target, picture)
+        self.newest = max(self.newest, file.stat().st_mtime)
+
+    def finish(
+        self,
+        person: Mapping[str, Any],
+        cameras: list[dict[str, Any]],
+        lights: Sequence[Light],
+        ids: Sequence[str],
+        scan: Path | None = None,
+    ) -> None:
+        """Write the other files, capture.json last; without the frames if they have
+        faults.
+        """
+        if self.faults:
+            shutil.rmtree(self.out)
+            raise InputError(self.faults)
+        bits = 8 * self.dtype.itemsize
+        for camera in cameras:
+            camera |= {} if self.linear else {"bit_depth": bits}
+            if self.srgb:
+                camera["response"] = "dome/response.csv"
+        if self.srgb:
+            private_file(self.out / "dome/response.csv").write_text(
+                _srgb_table(2**bits)
+            )
+        white = max(self.levels, default=1.0) or 1.0
+        dome = {
+            "cameras": cameras,
+            "lights": _light_records(lights, ids, white),
+            "relative": True,
+            "exposures": [{"id": "e0", "seconds": 1.0}],
+            "frames": f"dome/frames/{{light}}_{{camera}}{self.suffix}",
+        }
+        time = datetime.fromtimestamp(self.newest, UTC)
+        record = _record(person, time) | {"dome": "dome/dome.json"}
+        if scan is not None:
+            record["mesh"] = f"scan{scan.suffix.lower()}"
+            content = read_regular(scan, MAX_SCAN_BYTES)
+            private_file(self.out / record["mesh"]).write_bytes(content)
+        for name, value in (("dome/dome.json", dome), ("capture.json", record)):
+            text = json.dumps(value, indent=1)
+            private_file(self.out / name).write_text(text, encoding="utf-8")
+
+
+def read_lights(path: Path) -> list[Light]:
+    """Lights of a CSV or RTI .lp file, in its order.
+
+    Values are separated by commas, semicolons, tabs or spaces. Without a header, a line is a
+    name and a direction; a header names columns: the first one is the picture, `x, y, z`
+    a direction or `x_mm, y_mm, z_mm` a position, `intensity` a relative intensity.
+
+    Raises
+    ------
+    InputError
+        With every line that is not a light, and names that are given twice.
+    """
+    try:
+        text = read_regular(path, MAX_TABLE_BYTES).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise _table_fault(path, "must be UTF-8 text", "other bytes") from None
+    faults = list[Fault]()
+    found = list[Light]()
+    header = list[str]()
+    for number, line in enumerate(text.splitlines(), 1):
+        words = _words(line)
+        if not words or (not found and len(words) == 1 and words[0].isdigit()):
+            continue  # .lp files begin with the number of pictures
+        values = _numbers(words[1:])
+        if not found and not header and any(value is None for value in values[-3:]):
+            header = [word.lower() for word in words]
+            continue
+        place = f"{path}, line {number}"
+        light = attempt(faults, partial(_table_light, words, header, place))
+        if light is not None:
+            found.append(light)
+    names = [light.name for light in found]
+    for name in sorted({name for name in names if names.count(name) > 1}):
+        rule = "a picture must have one light"
+        cure = "remove the lines that do not apply"
+        faults.append(Fault(str(path), rule, f"{short(name)} twice", cure))
+    if faults:
+        raise InputError(faults)
+    if not 1 <= len(found) <= MAX_LIGHTS:
+        finding = f"{len(found)} lights"
+        raise _table_fault(path, f"must have 1 to {MAX_LIGHTS:,} lights", finding)
+    return found
+
+
+def read_picture(path: Path) -> Picture:
+    """A picture (h, w, 3) as it is looked at: uint8, uint16 or float radiance; grey is
+    repeated, transparency dropped, and the orientation of JPEG files applied.
+
+    Raises
+    ------
+    InputError
+        If it is not a whole picture of a known format.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".exr":
+        return read_frame(path)
+    content = read_regular(path, MAX_FRAME_BYTES)
+    try:
+        if suffix == ".png":
+            picture = np.asarray(imagecodecs.png_decode(content))
+        elif suffix in (".tif", ".tiff"):
+            picture = np.asarray(imagecodecs.tiff_decode(content))
+        elif suffix in SUFFIXES:
+            with Image.open(io.BytesIO(content)) as image:
+                if image.width * image.height > MAX_FRAME_PIXELS:
+                    raise ValueError(f"{image.width} x {image.height} pixels")
+                turned = ImageOps.exif_transpose(image)
+                picture = np.asarray(turned.convert("RGB"))
+        else:
+            raise ValueError(f"a file {path.suffix}")
+    except (ValueError, RuntimeError, OSError, UnidentifiedImageError) as error:
+        rule = f"a picture must be a whole {FORMATS} file"
+        cure = "export it again; raw and HEIC files have to be converted to TIFF"
+        raise input_error(str(path), rule, short(str(error)), cure) from None
+    if picture.ndim == 2:
+        picture = picture[..., None]
+    if picture.ndim != 3 or picture.dtype not in (np.uint8, np.uint16):
+        rule = "a picture must have 8 or 16 bits per channel"
+        finding = f"{picture.dtype} of {' x '.join(map(str, picture.shape))}"
+        raise input_error(str(path), rule, finding, "export it as PNG or TIFF")
+    if picture.shape[2] < 3:
+        picture = np.repeat(picture[..., :1], 3, axis=2)
+    return np.array(picture[..., :3])
+
+
+def _words(line: str) -> list[str]:
+    """Cells of a line of a table; a name in front may contain spaces."""
+    line = line.split("#", 1)[0].strip()
+    for separator in (";", ",", "\t"):
+        if separator in line:
+            return [cell.strip().strip('"') for cell in line.split(separator)]
+    words = line.split()
+    front = len(words)
+    while front > 1 and _numbers(words[front - 1 : front])[0] is not None:
+        front -= 1
+    if front == 1 or front == len(words):
+        return words
+    return [" ".join(words[:front]), *words[front:]]
+
+
+def _numbers(words: Sequence[str]) -> list[float | None]:
+    values: list[float | None] = []
+    for word in words:
+        try:
+            values.append(float(word))
+        except ValueError:
+            values.append(None)
+    return values
+
+
+def _table_light(words: Sequence[str], header: Sequence[str], place: str) -> Light:
+    """The light of a line."""
+    cells = dict(zip(header or ("picture", *COLUMNS), words, strict=False))
+    name = re.split(r"[\\/]", words[0])[-1]
+    distant = not set(POSITION_COLUMNS) <= set(cells)
+    values = _numbers(
+        [cells.get(key, "") for key in (COLUMNS if distant else POSITION_COLUMNS)]
+    )
+    gain = _numbers([cells.get("intensity", "1")])[0]
+    vector = np.array([np.nan if value is None else value for value in values])
+    usable = np.isfinite(vector).all() and np.linalg.norm(vector) > 0
+    require(
+        bool(name) and bool(usable) and gain is not None and 0 < gain < np.inf,
+        place,
+        "must be a picture and the direction x, y, z to its light (or x_mm, y_mm, z_mm "
+        "of a header); an intensity is positive",
+        short(", ".join(words)),
+        "correct the line",
+    )
+    return Light(name, vector, distant, float(gain or 1.0))
+
+
+def _table_fault(path: Path, rule: str, found: str) -> InputError:
+    return input_error(str(path), f"a table of lights {rule}", found, "correct it")
+
+
+def _table_file(source: Path, given: str | Path | None) -> Path:
+    """The table of the lights."""
+    if given is not None:
+        return Path(given)
+    table = source / "lights.csv"
+    listed = sorted(source.glob("*.lp"))
+    if not table.exists() and len(listed) == 1:
+        return listed[0]
+    require(
+        table.exists(),
+        str(source),
+        "the directions of the lights must be known: lights.csv, or one .lp file",
+        f"{len(listed)} .lp files" if listed else "neither",
+        "write a line for each picture: its name, x, y, z; x to the right, y up, z to the "
+        "camera; or photograph a mirror ball",
+    )
+    return table
+
+
+def _pictures(source: Path) -> list[Path]:
+    """Pictures of a folder, numbers in their names in numerical order."""
+    require(
+        source.is_dir(),
+        str(source),
+        "the source of an import is a folder",
+        "a file" if source.exists() else "nothing",
+        "name the folder of the pictures",
+    )
+    files = [x for x in source.iterdir() if x.suffix.lower() in SUFFIXES]
+    files = [x for x in files if x.is_file() and not x.name.startswith(".")]
+    require(
+        bool(files),
+        str(source),
+        f"the folder must have pictures ({FORMATS})",
+        "none",
+        "convert raw and HEIC files to TIFF",
+    )
+    return sorted(files, key=_natural)
+
+
+def _natural(path: Path) -> list[tuple[int, int, str]]:
+    parts = re.split(r"(\d+)", path.name.lower())
+    return [(0, int(x), "") if x.isdigit() else (1, 0, x) for x in parts if x]
+
+
+def _matched(source: Path, files: Sequence[Path], table: Sequence[Light]) -> list[Path]:
+    """The pictures of the lights, by name or without its suffix."""
+    by_name = {file.name.lower(): file for file in files}
+    by_stem = {file.stem.lower(): file for file in files}
+    faults = []
+    pairs = []
+    for light in table:
+        name = light.name.lower()
+        file = by_name.get(name) or by_stem.get(name) or by_stem.get(Path(name).stem)
+        if file is None:
+            rule = "every light of the table must have a picture"
+            cure = "correct the name, or remove the line"
+            faults.append(Fault(str(source), rule, f"no {short(light.name)}", cure))
+        else:
+            pairs.append(file)
+    if faults:
+        raise InputError(faults)
+    require(
+        len(pairs) >= 3,
+        str(source),
+        "normals need pictures under three lights or more",
+        f"{len(pairs)}",
+        "photograph the subject under more lights",
+    )
+    return pairs
+
+
+def _from_ball(folder: Path, files: Sequence[Path]) -> list[Light]:
+    """Directions of the lights of `files`, from pictures of a mirror ball."""
+    balls = _pictures(folder)
+    masks = [file for file in balls if "mask" in file.stem.lower()]
+    balls = [file for file in balls if file not in masks]
+    require(
+        len(masks) == 1 and len(balls) == len(files),
+        str(folder),
+        "a mirror ball needs one picture *mask*, and one picture for each light",
+        f"{len(masks)} masks, {len(balls)} pictures for {len(files)} of the subject",
+        "add the missing ones, in the same order",
+    )
+    outline = ball_outline(_bright(masks[0]))
+    return [
+        Light(
+            file.name,
+            distant_light(outline, highlight_centre(read_picture(ball), outline)),
+            distant=True,
+        )
+        for ball, file in zip(balls, files, strict=True)
+    ]
+
+
+def _bright(path: Path) -> Mask:
+    """Bright pixels of a mask."""
+    picture = read_picture(path)
+    return np.asarray(picture.max(axis=-1) > picture.max() / 2)
+
+
+def _mask(path: Path | None, size: tuple[int, int]) -> Mask:
+    if path is None:
+        return np.ones(size, bool)
+    inside = _bright(path)
+    require(
+        inside.shape == size,
+        str(path),
+        f"a mask must be as large as the pictures, {size[1]} x {size[0]}",
+        f"{inside.shape[1]} x {inside.shape[0]}",
+        "draw it again",
+    )
+    return inside
+
+
+def _only(files: Sequence[Path]) -> Path | None:
+    return files[0] if len(files) == 1 else None
+
+
+def _ids(names: Sequence[str]) -> list[str]:
+    """Identifiers: the names if they can be used and stay distinct, else numbers."""
+    stems = [Path(name).stem for name in names]
+    usable = all(re.fullmatch(IDENTIFIER.pattern, stem) for stem in stems)
+    if usable and len({stem.lower() for stem in stems}) == len(stems):
+        return stems
+    return [f"l{k:03d}" for k in range(len(names))]
+
+
+def _distant_camera(width: int, height: int, width_mm: float) -> dict[str, Any]:
+    """A camera whose picture is `width_mm` wide at the origin: x right, y up, z to it."""
+    focal = CAMERA_DISTANCE_MM * width / width_mm
+    return {
+        "id": CAMERA,
+        "width": width,
+        "height": height,
+        "K": [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]],
+        "R": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+        "t": [0, 0, CAMERA_DISTANCE_MM],
+    }
+
+
+def _light_records(
+    lights: Sequence[Light], ids: Sequence[str], white: float
+) -> list[dict[str, Any]]:
+    """Lights of dome.json; a facing surface of R_d 0.5 is as bright as `white`."""
+    near = [float(np.linalg.norm(x.vector)) for x in lights if not x.distant]
+    square = float(np.median(near)) ** 2 if near else 1.0
+    irradiance = np.pi * white / WHITE_REFLECTANCE
+    records = []
+    for light, name in zip(lights, ids, strict=True):
+        key = "direction" if light.distant else "position"
+        factor = 1.0 if light.distant else square
+        records.append(
+            {
+                "id": name,
+                key: light.vector.tolist(),
+                "intensity": [irradiance * factor * light.gain] * 3,
+            }
+        )
+    return records
+
+
+def _srgb_table(count: int) -> str:
+    """Response of sRGB (IEC 61966-2-1): values of the file and relative exposures."""
+    value = np.arange(count)
+    level = value / (count - 1)
+    exposure = np.where(
+        level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4
+    )
+    # the first interval carries no light in the middle of a value
+    rows = [
+        f"{v},{e:.9g},{e:.9g},{e:.9g}" for v, e in zip(value, exposure, strict=True)
+    ]
+    return "\n".join(["dn,r,g,b", *rows]) + "\n"
+
+
+def _read_cameras(source: Path, given: Path | None) -> list[dict[str, Any]]:
+    """Cameras of a JSON file, or of the text files of COLMAP."""
+    path = given or (
+        source / "cameras.json" if (source / "cameras.json").exists() else source
+    )
+    if path.is_dir():
+        return _colmap_cameras(path)
+    faults = list[Fault]()
+    data = read_json(path, faults)
+    fields = Fields(
+        {"cameras": data} if isinstance(data, list) else data, str(path), faults
+    )
+    if not faults:
+        fields.items("cameras", maximum=MAX_CAMERAS)
+    if faults:
+        raise InputError(faults)
+    keys = ("id", "width", "height", "K", "R", "t", "distortion")
+    return [
+        {key: item[key] for key in keys if key in item}
+        for item in fields.data["cameras"]
+    ]
+
+
+def _colmap_cameras(folder: Path) -> list[dict[str, Any]]:
+    """Cameras of cameras.txt and images.txt; images are named after the cameras."""
+    tables = {name: folder / f"{name}.txt" for name in ("cameras", "images")}
+    require(
+        all(path.exists() for path in tables.values()),
+        str(folder),
+        "cameras must be in cameras.json, or in cameras.txt and images.txt of COLMAP",
+        "neither",
+        "export the model of COLMAP as text, or write cameras.json",
+    )
+    lines = {
+        name: [
+            line.split()
+            for line in read_regular(path, MAX_TABLE_BYTES * 16).decode().splitlines()
+            if not line.startswith("#")
+        ]
+        for name, path in tables.items()
+    }
+    place = str(tables["cameras"])
+    lenses = {}
+    found = []
+    try:
+        for number, model, width, height, *values in filter(None, lines["cameras"]):
+            lens = _colmap_lens(model, [float(value) for value in values], place)
+            lenses[number] = {"width": int(width), "height": int(height), **lens}
+        place = str(tables["images"])
+        # every second line lists points
+        for words in lines["images"][::2]:
+            _, *pose, number, name = words
+            w, x, y, z, *t = map(float, pose)
+            found.append(
+                {
+                    "id": Path(name).parts[0] if "/" in name else Path(name).stem,
+                    **lenses[number],
+                    "R": Rotation.from_quat([x, y, z, w]).as_matrix().tolist(),
+                    "t": t,
+                }
+            )
+    except (ValueError, KeyError) as error:
+        rule = "must be a text model of COLMAP"
+        cure = "export the model as text again"
+        raise input_error(place, rule, short(str(error)), cure) from None
+    return found
+
+
+def _colmap_lens(model: str, v: Sequence[float], place: str) -> dict[str, Any]:
+    """K and distortion k1 k2 p1 p2 k3 of a camera model of COLMAP."""
+    if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
+        focal, cx, cy, *radial = v
+        K = [[focal, 0, cx], [0, focal, cy], [0, 0, 1]]
+        lens = [*radial, 0.0, 0.0][:2]
+        return {"K": K, "distortion": [*lens, 0.0, 0.0, 0.0]}
+    if model in ("PINHOLE", "OPENCV"):
+        fx, fy, cx, cy, *lens = v
+        K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
+        return {"K": K, "distortion": [*(lens or [0.0] * 4), 0.0]}
+    raise input_error(
+        place,
+        "the camera model must be SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV",
+        model,
+        "undistort the pictures with COLMAP",
+    )
+
+
+def _olat_files(
+    source: Path, lights: Sequence[str], cameras: Sequence[str]
+) -> tuple[str, dict[tuple[str, str], Path]]:
+    """The pattern of the pictures, and the picture of every light and camera."""
+    best: tuple[int, str, dict[tuple[str, str], Path]] = (-1, "", {})
+    for pattern in PATTERNS:
+        files = {}
+        for light in lights:
+            for camera in cameras:
+                stem = pattern.format(light=Path(light).stem, camera=camera)
+                for suffix in SUFFIXES:
+                    path = source / f"{stem}{suffix}"
+                    if path.is_file():
+                        files[light, camera] = path
+                        break
+        if len(files) > best[0]:
+            best = (len(files), pattern, files)
+    count, pattern, files = best
+    missing = [(x, c) for x in lights for c in cameras if (x, c) not in files]
+    require(
+        not missing,
+        str(source),
+        "every light and camera must have a picture: CAMERA/LIGHT, LIGHT/CAMERA, "
+        "CAMERA_LIGHT or LIGHT_CAMERA",
+        f"{count} of {len(lights) * len(cameras)}"
+        + (
+            f", none of light {missing[0][0]}, camera {missing[0][1]}"
+            if missing
+            else ""
+        ),
+        "check the names in the tables of lights and cameras",
+    )
+    return pattern, files
+
+
+def _record(person: Mapping[str, Any], time: datetime) -> dict[str, Any]:
+    """Content of capture.json."""
+    session = time.isoformat(timespec="seconds")
+    return {"format": FORMAT, "version": 2, "session": session, **person}
+
+
+def _require_writable(out: Path, person: Mapping[str, Any]) -> None:
+    """Require a record without faults, and a folder that does not exist."""
+    if faults := record_faults(_record(person, datetime.now(UTC))):
+        raise InputError(faults)
+    require(
+        not out.exists() or (out.is_dir() and not any(out.iterdir())),
+        str(out),
+        "an import writes a new folder",
+        "files",
+        "name another folder, or remove this one",
+    )

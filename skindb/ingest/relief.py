@@ -1,0 +1,326 @@
+"""The surface of a capture without a scan: normals by photometric stereo of the pictures
+of one camera, integrated to a mesh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, diags_array
+from scipy.sparse.linalg import splu
+
+from skindb.calibration._merge_kernels import OK
+from skindb.calibration.irradiance import light_falloff
+from skindb.calibration.radiance import FrameMerger, read_view
+from skindb.errors import attempt_all, require
+from skindb.format.dome import CameraRecord, DomeRecord, LightRecord
+from skindb.geometry.clean import CleanMesh, clean_mesh
+from skindb.geometry.scan import Scan
+from skindb.types import Float64, Index, Mask
+
+# error of the normals for which their prior has no effect [degree]
+NO_SCAN_DEGREES = 60.0
+MAX_POINTS = 250_000  # of the grid; the equations of more take minutes
+MIN_LIGHTS = 3
+# of the brightest lights of a pixel; darker ones are in a shadow or graze the surface
+SHADOW_FRACTION = 0.08
+BRIGHT_QUANTILE = 0.9
+# of the brightest pixels; pixels that no light brightens further are background
+BACKGROUND_FRACTION = 0.02
+# smallest over largest eigenvalue of the lights' directions, below which they are in a plane
+MIN_SPREAD = 2e-3
+ROUNDS = 5  # of reweighting; the weights of a sixth differ by less than a percent
+# of the scale of residuals, from which samples count less (Holland and Welsch 1977)
+CAUCHY = 2.385
+MIN_COSINE = 0.1  # to the camera; slopes beyond it are not measurable
+# of neighbouring points: depth over width, from which the surface is torn apart
+MAX_SLOPE = 8.0
+# distance of the nearest light over the size of the surface, below which directions
+# differ between points
+NEAR = 50.0
+
+
+@dataclass(frozen=True)
+class Relief:
+    """A surface that was estimated from photographs, and where they show light."""
+
+    scan: Scan
+    surface: CleanMesh
+    lit: Mask  # (light, rows, columns) of the grid
+    step: int  # pixels between the points of the grid
+
+    def light_fraction(
+        self, camera: CameraRecord, position: Float64
+    ) -> NDArray[np.float16]:
+        """Whether each surfel (n, light) at `position` (n, 3) is lit: 1 or 0."""
+        column, row = np.floor(camera.project(position) / self.step).astype(int).T
+        _, rows, columns = self.lit.shape
+        at = np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)
+        return np.asarray(self.lit[:, at[0], at[1]].T, np.float16)
+
+
+def estimate_relief(
+    dome: DomeRecord,
+    mergers: Mapping[str, FrameMerger],
+    pool: Executor,
+    *,
+    spacing_mm: float,
+) -> Relief:
+    """Estimate the surface that the only camera of a dome shows.
+
+    Normals are those of a matt surface, fitted robustly to the lights that reach a
+    pixel (Woodham 1980), and are integrated with weights that tear the surface at steps
+    of depth. Where lights are near, both are repeated with the directions of the lights
+    from the points of the first surface.
+
+    Parameters
+    ----------
+    dome
+        One camera; lights without an intensity are taken as equal.
+    mergers, pool
+        Frame merger of the camera; threads that decode.
+    spacing_mm
+        Wanted distance of the points, at the origin.
+
+    Raises
+    ------
+    InputError
+        If a frame cannot be decoded, or fewer than three lights reach every pixel.
+    """
+    camera = dome.cameras[0]
+    values, step = _grey_pictures(dome, mergers[camera.id], pool, spacing_mm)
+    lit = _lit(values)
+    rows, columns = lit.shape[1:]
+    pixels = (np.mgrid[:columns, :rows].T + 0.5) * step
+    rays = camera.rays(pixels)
+    # the plane through the origin, parallel to the picture
+    forward = camera.R[2]
+    depth = np.full((rows, columns), float(-camera.centre @ forward))
+    rays /= (rays @ forward)[..., None]
+    rounds = 2 if _near(dome, depth[0, 0], rays) else 1
+    for _ in range(rounds):
+        points = camera.centre + depth[..., None] * rays
+        normal = photometric_normals(values, lit, dome.lights, points, -rays)
+        known: Mask = np.asarray(np.isfinite(normal).all(axis=-1))
+        require(
+            bool(known.any()),
+            f"{dome.file}[frames]",
+            f"at least {MIN_LIGHTS} lights that are not in a plane must reach a pixel",
+            f"none of {rows * columns:,} pixels is lit by so many",
+            "add lights, or a scan",
+        )
+        depth = depth[0, 0] * np.exp(_integrated(normal, known, rays))
+    vertices = (camera.centre + depth[..., None] * rays).reshape(-1, 3)
+    width = step * camera.pixel_width(np.zeros(3))
+    faces = _faces(known, depth, width)
+    return Relief(Scan(vertices, faces), clean_mesh(vertices, faces), lit, step)
+
+
+def _grey_pictures(
+    dome: DomeRecord, merger: FrameMerger, pool: Executor, spacing_mm: float
+) -> tuple[NDArray[np.float32], int]:
+    """Mean radiance (light, rows, columns) of the squares of a grid, over the intensity
+    of the light; NaN where pixels are saturated. The width of the squares in pixels.
+    """
+    camera = merger.camera
+    area = camera.width * camera.height
+    wanted = spacing_mm / camera.pixel_width(np.zeros(3))
+    step = max(round(wanted), int(np.ceil(np.sqrt(area / MAX_POINTS))), 1)
+    step = min(step, camera.width // 2 or 1, camera.height // 2 or 1)
+    rows, columns = camera.height // step, camera.width // step
+
+    def picture(light: LightRecord) -> NDArray[np.float32]:
+        radiance, flag = merger.merge(read_view(dome, light.id, camera))
+        radiance[(flag != OK) & ~np.isfinite(radiance).all(axis=-1)] = np.nan
+        grey = radiance.mean(axis=-1)[: rows * step, : columns * step]
+        grey = grey.reshape(rows, step, columns, step).mean(axis=(1, 3))
+        factor = 1.0 if light.intensity is None else 1 / light.intensity.mean()
+        return np.asarray(grey * factor, np.float32)
+
+    return np.stack(attempt_all([], picture, dome.lights, pool=pool)), step
+
+
+def _lit(values: NDArray[np.float32]) -> Mask:
+    """Where (light, rows, columns) a picture shows light, neither shadow nor saturation."""
+    bright = np.nanquantile(np.nan_to_num(values), BRIGHT_QUANTILE, axis=0)
+    shown = bright > BACKGROUND_FRACTION * np.quantile(bright, 0.99)
+    return np.asarray(
+        np.isfinite(values) & (values > SHADOW_FRACTION * bright) & (values > 0) & shown
+    )
+
+
+def _near(dome: DomeRecord, distance: float, rays: Float64) -> bool:
+    """Whether directions of lights differ over the surface."""
+    size = distance * float(np.linalg.norm(rays[-1, -1] - rays[0, 0]))
+    nearest = min(float(np.linalg.norm(light.position)) for light in dome.lights)
+    return nearest < NEAR * size
+
+
+def photometric_normals(
+    values: NDArray[np.float32],
+    lit: Mask,
+    lights: tuple[LightRecord, ...],
+    points: Float64,
+    towards: Float64,
+) -> Float64:
+    """Unit normals (rows, columns, 3) of a matt surface by robust least squares.
+
+    Parameters
+    ----------
+    values
+        (light, rows, columns) radiance over intensity.
+    lit
+        Where they are used.
+    lights
+        Positions and fall-off.
+    points, towards
+        (rows, columns, 3) points in mm, and directions towards the camera.
+
+    Returns
+    -------
+    ndarray
+        NaN where fewer than three lights are used, where these are in a plane, or where
+        the normal faces away from the camera.
+    """
+    shape = lit.shape[1:]
+    at = np.flatnonzero((lit.sum(axis=0) >= MIN_LIGHTS).ravel())
+    place = points.reshape(-1, 3)[at]
+    value = values.reshape(len(lights), -1)[:, at]
+    weight = lit.reshape(len(lights), -1)[:, at].astype(np.float64)
+    direction = np.empty((len(lights), len(at), 3))
+    for j, light in enumerate(lights):
+        square, falloff = light_falloff(light, place)
+        way = light.position - place
+        direction[j] = way / np.sqrt(square)[:, None]
+        # so that value = direction . solution for a matt surface
+        value[j] *= square / np.maximum(falloff, 1e-6)
+    value = np.where(weight > 0, value, 0.0)
+    solution = np.zeros((len(at), 3))
+    used = weight
+    for _ in range(ROUNDS):
+        # einsum of three factors is slow
+        weighted = used[..., None] * direction
+        system = np.einsum("jpa,jpb->pab", weighted, direction, optimize=True)
+        right = np.einsum("jpa,jp->pa", weighted, value)
+        ridge = 1e-12 * np.trace(system, axis1=1, axis2=2)
+        system += ridge[:, None, None] * np.eye(3)
+        solution = np.linalg.solve(system, right[..., None])[..., 0]
+        residual = np.abs(np.einsum("jpa,pa->jp", direction, solution) - value)
+        scale = np.nanmedian(np.where(weight > 0, residual, np.nan), axis=0) / 0.6745
+        ratio = residual / (CAUCHY * np.maximum(scale, 1e-9 * np.abs(value).max()))
+        used = weight / (1 + ratio**2)
+    spread = np.linalg.eigvalsh(
+        np.einsum("jpa,jpb->pab", weight[..., None] * direction, direction)
+    )
+    length = np.linalg.norm(solution, axis=1)
+    normal = np.full((lit[0].size, 3), np.nan)
+    unit = solution / np.maximum(length, 1e-300)[:, None]
+    view = towards.reshape(-1, 3)[at]
+    facing = np.einsum("pa,pa->p", unit, view) / np.linalg.norm(view, axis=1)
+    good = (spread[:, 0] > MIN_SPREAD * spread[:, 2]) & (facing > 0) & (length > 0)
+    normal[at[good]] = unit[good]
+    return normal.reshape(*shape, 3)
+
+
+def _integrated(normal: Float64, known: Mask, rays: Float64) -> Float64:
+    """Logarithm of the relative depth (rows, columns); 0 where no normal is known.
+
+    The gradient of the logarithm of the depth Z along the picture follows from
+    P = C + Z r and n . dP = 0: it is -(n . dr) / (n . r).
+    """
+    shape = known.shape
+    number = np.full(shape, -1)
+    number[known] = np.arange(known.sum())
+    cosine = np.einsum("hwa,hwa->hw", normal, rays)
+    length = np.linalg.norm(rays, axis=-1)
+    cosine = np.minimum(cosine, -MIN_COSINE * length)
+    first, second, slope, weight = [], [], [], []
+    for axis in (0, 1):
+        a, b = np.moveaxis(known, axis, 0)[:-1], np.moveaxis(known, axis, 0)[1:]
+        both = a & b
+        turned = np.moveaxis(rays, axis, 0)
+        change = turned[1:] - turned[:-1]
+        n = np.moveaxis(normal, axis, 0)
+        c = np.moveaxis(cosine, axis, 0)
+        along = [
+            -np.einsum("hwa,hwa->hw", part, change)[both] / facing[both]
+            for part, facing in ((n[:-1], c[:-1]), (n[1:], c[1:]))
+        ]
+        ids = np.moveaxis(number, axis, 0)
+        first.append(ids[:-1][both])
+        second.append(ids[1:][both])
+        slope.append((along[0] + along[1]) / 2)
+        lengths = np.moveaxis(length, axis, 0)
+        facing = np.minimum(-c[:-1] / lengths[:-1], -c[1:] / lengths[1:])[both]
+        weight.append(facing**2)
+    solution = _robust_heights(
+        np.concatenate(first),
+        np.concatenate(second),
+        np.concatenate(slope),
+        np.concatenate(weight),
+        int(known.sum()),
+    )
+    out = np.zeros(shape)
+    out[known] = solution
+    return out
+
+
+def _robust_heights(
+    first: Index, second: Index, slope: Float64, weight: Float64, count: int
+) -> Float64:
+    """Heights (count,) whose differences are closest to `slope`, with weights that
+    decrease with the residuals, so that steps of depth stay local.
+    """
+    height = np.zeros(count)
+    if not len(slope):
+        return height
+    edges = np.arange(len(slope))
+    ones = np.ones(len(slope))
+    difference = coo_array(
+        (
+            np.concatenate([-ones, ones]),
+            (np.concatenate([edges, edges]), np.concatenate([first, second])),
+        ),
+        shape=(len(slope), count),
+    ).tocsr()
+    used = weight
+    for _ in range(3):
+        scaled = diags_array(used) @ difference
+        # every part of the surface stays at the mean depth
+        system = (difference.T @ scaled + 1e-7 * diags_array(np.ones(count))).tocsc()
+        height = splu(system, permc_spec="MMD_AT_PLUS_A").solve(
+            difference.T @ (used * slope)
+        )
+        residual = np.abs(difference @ height - slope)
+        scale = np.median(residual) / 0.6745
+        used = weight / (1 + (residual / max(CAUCHY * scale, 1e-12)) ** 2)
+    return np.asarray(height)
+
+
+def _faces(known: Mask, depth: Float64, width: float) -> Index:
+    """Triangles (f, 3) of the points of the grid, which face the camera and do not cross
+    steps of depth.
+    """
+    rows, columns = known.shape
+    number = np.arange(rows * columns).reshape(rows, columns)
+    corners = np.stack(
+        [
+            part.ravel()
+            for part in (
+                number[:-1, :-1],
+                number[1:, :-1],
+                number[1:, 1:],
+                number[:-1, 1:],
+            )
+        ],
+        axis=1,
+    )
+    near = depth.ravel()[corners]
+    whole = known.ravel()[corners].all(axis=1)
+    whole &= np.ptp(near, axis=1) < MAX_SLOPE * width
+    corners = corners[whole]
+    return np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])

@@ -1,0 +1,155 @@
+"""From a folder of pictures to maps and a page, without a database."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from skindb.errors import require
+from skindb.files import make_private, private_umask
+from skindb.format.fields import NAME, read_json
+from skindb.geometry.camera import project
+from skindb.ingest.pictures import Response, import_images
+from skindb.render.image import write_exr, write_png
+from skindb.schema import FitStatus
+from skindb.store.database import Database
+from skindb.types import Float64, Progress
+from skindb.workflow.captures import ingest_take
+from skindb.workflow.fit import fit_take
+from skindb.workflow.pictures import view_takes
+
+# of the grid; more make a page that browsers turn slowly
+MAX_POINTS = 60_000
+# sRGB of the brightest hundredth of the albedo, which is relative
+BRIGHT = 0.9
+PAGE = "page.html"
+MAPS = ("normals", "albedo", "gloss")
+
+
+def quick(
+    source: str | Path,
+    out: str | Path,
+    *,
+    lights: str | Path | None = None,
+    mirror_ball: str | Path | None = None,
+    mask: str | Path | None = None,
+    response: Response = "auto",
+    width_mm: float | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Maps of normals, albedo and gloss, and a page to turn and light them, from pictures
+    of one camera.
+
+    Parameters
+    ----------
+    source, lights, mirror_ball, mask, response, width_mm, progress
+        As in `skindb.ingest.import_images`.
+    out
+        Folder to write: normals, albedo and gloss as .png and .exr, and page.html.
+        Normals are in the frame of the picture: x to the right, y up, z to the camera.
+        It must not hold these files.
+
+    Returns
+    -------
+    dict
+        `files`; `notes` on what was assumed and what is missing; numbers of `points` by
+        fit_status; `normal_error`, the median stated error [degree].
+
+    Raises
+    ------
+    InputError
+        As in `import_images`, or if no pixel could be fitted.
+    """
+    out = Path(out)
+    names = [PAGE, *(f"{name}.{kind}" for name in MAPS for kind in ("png", "exr"))]
+    present = [name for name in names if (out / name).exists()]
+    rule = "results are not replaced"
+    cure = "name another folder, or remove them"
+    require(not present, str(out), rule, ", ".join(present), cure)
+    name = re.sub(r"[^A-Za-z0-9_-]+", "-", Path(source).resolve().name)[:64].strip("-")
+    subject = name if re.fullmatch(NAME.pattern, name) else "pictures"
+    consent = {"scope": ["fit", "export"], "reference": "quick, nothing is stored"}
+    with private_umask(), tempfile.TemporaryDirectory(prefix="skindb-") as folder:
+        capture = Path(folder) / "capture"
+        imported = import_images(
+            source,
+            capture,
+            {"subject": subject, "consent": consent},
+            lights=lights,
+            mirror_ball=mirror_ball,
+            mask=mask,
+            response=response,
+            width_mm=width_mm,
+            **({} if progress is None else {"progress": progress}),
+        )
+        (camera,) = read_json(capture / "dome/dome.json", [])["cameras"]
+        pixel = camera["t"][2] / camera["K"][0][0]
+        area = camera["width"] * camera["height"]
+        step = max(int(np.ceil(np.sqrt(area / MAX_POINTS))), 1)
+        db = Database(Path(folder) / "db")
+        record = ingest_take(db, capture, spacing_mm=step * pixel, progress=progress)
+        fit_take(db, record.take, progress=progress)
+        make_private(out)
+        view_takes(db, [record.take], out / PAGE, progress=progress)
+        model = db.read("model", record.take)
+        result = _write_maps(model, out, step)
+        skipped = [line for line in model.attrs["skipped"] if "white" in line]
+    notes = [*imported.notes, *skipped]
+    return {"files": [str(out / name) for name in names], "notes": notes} | result
+
+
+def _write_maps(model: xr.DataTree, out: Path, step: int) -> dict[str, Any]:
+    """Write the maps on the grid of the points, and describe them."""
+    fitted = model["fitted"].to_dataset().load()
+    dome = model["dome"].to_dataset()
+    lens = [
+        dome[f"camera_{name}"].values[0].astype(np.float64)
+        for name in ("matrix", "rotation", "translation", "distortion")
+    ]
+    pixel = project(fitted["surfel_position"].values.astype(np.float64), *lens)[0]
+    column, row = np.floor(pixel / step).astype(int).T
+    width, height = (int(x) // step for x in dome["camera_size"].values[0])
+    at = np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
+
+    def grid(values: NDArray[np.floating[Any]]) -> Float64:
+        out = np.full((height, width, values.shape[-1]), np.nan)
+        out[at] = values
+        return out
+
+    normal = grid(fitted["shading_normal"].values @ lens[1].T * [1, -1, -1])
+    albedo = grid(fitted["diffuse_reflectance"].values)
+    gloss = grid(fitted["surface_reflectance"].values[:, None])
+    pictures = {
+        "normals": (normal, (normal + 1) / 2),
+        "albedo": (albedo, _shown(albedo)),
+        "gloss": (gloss, np.repeat(_shown(gloss), 3, axis=2)),
+    }
+    for name, (values, shown) in pictures.items():
+        write_exr(out / f"{name}.exr", values.astype(np.float32))
+        alpha = np.isfinite(shown).all(axis=-1, keepdims=True)
+        filled = np.where(alpha, np.clip(shown, 0, 1), 0)
+        rgba = np.concatenate([filled, alpha], axis=-1)
+        write_png(out / f"{name}.png", np.rint(255 * rgba).astype(np.uint8))
+    status = fitted["fit_status"].values
+    error = fitted["normal_total_error"].values
+    return {
+        "points": {
+            x.name.lower(): int((status == x).sum())
+            for x in FitStatus
+            if (status == x).any()
+        },
+        "normal_error": float(np.nanmedian(error)) if error.size else None,
+    }
+
+
+def _shown(values: Float64) -> Float64:
+    """Values of a display: a square root, so that the brightest hundredth is bright."""
+    finite = values[np.isfinite(values)]
+    bright = float(np.quantile(finite, 0.99)) if finite.size else 1.0
+    return np.asarray(np.sqrt(np.maximum(values, 0) / max(bright, 1e-9)) * BRIGHT)

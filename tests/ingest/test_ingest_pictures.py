@@ -1,0 +1,317 @@
+"""Capture folders from pictures and tables of lights, and the surface that they show."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from planted_pictures import (
+    ALBEDO,
+    SIZE,
+    directions,
+    encoded,
+    radiance,
+    sphere_normals,
+    write_pictures,
+    write_table,
+)
+
+from skindb.errors import InputError
+from skindb.format.frames import write_frame
+from skindb.geometry.camera import project
+from skindb.ingest import (
+    IngestParameters,
+    import_images,
+    import_olat,
+    ingest_capture,
+    read_capture,
+)
+from skindb.ingest.pictures import read_lights, read_picture
+
+PERSON = {"subject": "P1", "consent": {"scope": ["fit"], "reference": "form 1"}}
+LIGHTS = directions(9)
+
+
+@pytest.fixture
+def pictures(tmp_path: Path) -> Path:
+    """A folder of pictures with 16 bits and lights.csv."""
+    folder = tmp_path / "pictures"
+    write_table(folder / "lights.csv", write_pictures(folder, LIGHTS), LIGHTS)
+    return folder
+
+
+def ingested(capture: Path, scratch: Path, spacing: float = 0.1):
+    """The version of a capture folder, loaded."""
+    with ingest_capture(
+        read_capture(capture), IngestParameters(spacing_mm=spacing), scratch=scratch
+    ) as tree:
+        return tree.load()
+
+
+def true_normals(tree) -> np.ndarray:
+    """Planted normals at the surfels."""
+    dome = tree["dome"].to_dataset()
+    position = tree["surfels"]["surfel_position"].values.astype(float)
+    lens = [
+        dome[f"camera_{name}"].values[0].astype(float)
+        for name in ("matrix", "rotation", "translation", "distortion")
+    ]
+    column, row = np.floor(project(position, *lens)[0]).astype(int).T
+    return sphere_normals()[row, column]
+
+
+def angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.degrees(np.arccos(np.clip((a * b).sum(axis=-1), -1, 1)))
+
+
+def test_a_surface_is_estimated_without_a_scan(pictures: Path, tmp_path: Path) -> None:
+    result = import_images(pictures, tmp_path / "capture", PERSON, width_mm=48)
+    assert (result.lights, result.cameras) == (9, 1)
+    tree = ingested(tmp_path / "capture", tmp_path)
+    assert float(tree["surfels"]["scan_normal_error"]) == 60
+    assert int(tree["dome"]["relative_reflectance"]) == 1
+    truth = true_normals(tree)
+    inner = truth[:, 2] > 0.5
+    assert inner.sum() > 700
+    miss = angle(tree["surfels"]["surfel_normal"].values, truth)[inner]
+    # one pixel is 3 degrees of the sphere
+    assert np.median(miss) < 3
+    # the depth of the sphere from its rim inwards: 1 mm is one pixel
+    z = tree["surfels"]["surfel_position"].values[:, 2]
+    depth = 20 * truth[:, 2]
+    shift = np.median((z - depth)[inner])
+    assert np.abs(z - depth - shift)[inner].max() < 1.5
+    assert any("no prior" in line for line in tree.attrs["skipped"])
+    assert any("relative" in line for line in tree.attrs["skipped"])
+
+
+def test_samples_have_one_scale_for_all_captures_of_a_rig(
+    pictures: Path, tmp_path: Path
+) -> None:
+    import_images(pictures, tmp_path / "capture", PERSON)
+    tree = ingested(tmp_path / "capture", tmp_path)
+    sample = tree["samples"]["reflectance_sample"].values[:, 0, 0]
+    # white is R_d 0.5, facing: the planted radiance is 1.6 times the albedo
+    facing = true_normals(tree)[:, 2] > 0.99
+    expected = 1.6 * np.array(ALBEDO) * 0.5 / np.pi
+    # the pixels around the pole face the light by 0.99 to 1
+    assert np.allclose(np.nanmean(sample[facing], axis=0), expected, rtol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "dtype", "srgb"),
+    [
+        (".tif", "uint16", False),
+        (".exr", "float32", False),
+        (".png", "uint8", True),
+    ],
+)
+def test_formats_give_the_same_normals(
+    tmp_path: Path, suffix: str, dtype: str, srgb: bool
+) -> None:
+    folder = tmp_path / "pictures"
+    names = write_pictures(folder, LIGHTS, suffix=suffix, dtype=dtype, srgb=srgb)
+    write_table(folder / "x.lp", names, LIGHTS, separator=" ")
+    result = import_images(folder, tmp_path / "capture", PERSON)
+    assert any("sRGB" in note for note in result.notes) == srgb
+    tree = ingested(tmp_path / "capture", tmp_path)
+    truth = true_normals(tree)
+    inner = truth[:, 2] > 0.5
+    miss = angle(tree["surfels"]["surfel_normal"].values, truth)[inner]
+    assert np.median(miss) < 3
+
+
+def test_near_lights_are_used_at_their_positions(tmp_path: Path) -> None:
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    # 1 mm a pixel; the origin is at the mean depth of the hemisphere of radius 20 mm
+    position = 70.0 * LIGHTS + [[0, 0, 40 / 3]]
+    normal = np.nan_to_num(sphere_normals())
+    rows = []
+    for k, light in enumerate(position):
+        way = light - 20.0 * normal
+        square = (way**2).sum(axis=-1)
+        cosine = np.maximum((normal * way).sum(axis=-1), 0) / np.sqrt(square)
+        linear = (cosine * 2000 / square)[..., None] * np.array(ALBEDO)
+        write_frame(folder / f"{k}.png", encoded(linear, "uint16", srgb=False))
+        rows.append(f"{k}.png,{light[0]},{light[1]},{light[2] - 40 / 3}")
+    text = "\n".join(["picture,x_mm,y_mm,z_mm", *rows])
+    (folder / "lights.csv").write_text(text)
+    import_images(folder, tmp_path / "near", PERSON, width_mm=SIZE)
+    tree = ingested(tmp_path / "near", tmp_path)
+    near = true_normals(tree)
+    inner = near[:, 2] > 0.5
+    miss = angle(tree["surfels"]["surfel_normal"].values, near)[inner]
+    text = text.replace("_mm", "")
+    (folder / "lights.csv").write_text(text)
+    import_images(folder, tmp_path / "far", PERSON, width_mm=SIZE)
+    tree = ingested(tmp_path / "far", tmp_path)
+    far = true_normals(tree)
+    inner = far[:, 2] > 0.5
+    wrong = angle(tree["surfels"]["surfel_normal"].values, far)[inner]
+    # the pole is 7 mm in front of the plane of the first round, of lights at 70 mm
+    assert np.median(miss) < 4 < 8 < np.median(wrong)
+
+
+def test_a_mirror_ball_gives_the_directions(tmp_path: Path) -> None:
+    folder = tmp_path / "pictures"
+    write_pictures(folder, LIGHTS)
+    ball = tmp_path / "ball"
+    ball.mkdir()
+    row, column = np.mgrid[:200, :200] + 0.5
+    away = np.stack([column - 100, 100 - row], axis=-1) / 80
+    disc = (away**2).sum(axis=-1) < 1
+    write_frame(
+        ball / "mask.png", np.repeat(disc[..., None] * np.uint8(255), 3, axis=2)
+    )
+    for k, light in enumerate(LIGHTS):
+        half = np.add(light, (0, 0, 1))
+        half /= np.linalg.norm(half)
+        spot = np.exp(-((away - half[:2]) ** 2).sum(axis=-1) / 2e-4) * disc
+        picture = np.rint(255 * np.repeat(spot[..., None], 3, axis=2))
+        write_frame(ball / f"{k}.png", picture.astype(np.uint8))
+    import_images(folder, tmp_path / "capture", PERSON, mirror_ball=ball)
+    dome = json.loads((tmp_path / "capture/dome/dome.json").read_text())
+    found = np.array([light["direction"] for light in dome["lights"]])
+    # a tenth of a pixel of the ball is 0.14 degrees
+    assert angle(found, LIGHTS).max() < 0.2
+
+
+def test_jpeg_is_turned_as_it_is_looked_at(tmp_path: Path) -> None:
+    values = np.zeros((20, 30, 3), np.uint8)
+    values[:, :10] = 200
+    image = Image.fromarray(values)
+    exif = image.getexif()
+    exif[0x0112] = 6  # to be turned by 90 degrees to the right
+    image.save(tmp_path / "x.jpg", exif=exif, quality=95)
+    picture = read_picture(tmp_path / "x.jpg")
+    assert picture.shape == (30, 20, 3)
+    assert picture[:8].min() > 180 > 20 > picture[12:].max()
+
+
+def test_a_mask_and_grey_pictures(pictures: Path, tmp_path: Path) -> None:
+    mask = np.zeros((SIZE, SIZE), np.uint8)
+    mask[:, : SIZE // 2] = 255
+    Image.fromarray(mask).save(pictures / "mask.png")
+    import_images(pictures, tmp_path / "capture", PERSON)
+    tree = ingested(tmp_path / "capture", tmp_path)
+    assert tree["surfels"]["surfel_position"].values[:, 0].max() < 0
+    assert np.array_equal(
+        read_picture(pictures / "mask.png"), np.repeat(mask[..., None], 3, axis=2)
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "lights"),
+    [
+        ("a.png 1 0 1\nb.png 0 1 1\n", 2),
+        ("2\nmy file.png 1 0 1\nC:\\x\\b.png 0 1 1\n", 2),
+        ("# comment\nname;x;y;z;intensity\na.png;1;0;1;2\nb.png;0;1;1;1\n", 2),
+    ],
+)
+def test_tables_of_lights(tmp_path: Path, text: str, lights: int) -> None:
+    path = tmp_path / "lights.csv"
+    path.write_text(text)
+    table = read_lights(path)
+    assert len(table) == lights
+    assert np.array_equal(table[0].vector, [1, 0, 1])
+    assert table[1].name == "b.png"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a.png,1,0,1\na.png,0,1,1\n", "twice"),
+        ("a.png,0,0,0\n", "line 1"),
+        ("a.png,1,nan,0\n", "line 1"),
+        ("picture,x,y,z\na.png,1,zero,1\n", "line 2"),
+        ("a.png,x,y,z,intensity\nb.png,1,0,1,-1\n", "line 2"),
+        ("", "0 lights"),
+    ],
+)
+def test_faulty_tables_are_refused(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "lights.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_lights(path)
+
+
+def test_every_faulty_picture_is_named_and_nothing_is_left(
+    pictures: Path, tmp_path: Path
+) -> None:
+    (pictures / "picture 3.png").write_bytes(b"no picture")
+    write_frame(pictures / "picture 5.png", np.zeros((4, 5, 3), np.uint16))
+    with pytest.raises(InputError) as error:
+        import_images(pictures, tmp_path / "capture", PERSON)
+    text = str(error.value)
+    assert "picture 3.png" in text
+    assert "picture 5.png" in text
+    assert not (tmp_path / "capture").exists()
+
+
+def test_lights_without_pictures_and_two_lights_are_refused(
+    pictures: Path, tmp_path: Path
+) -> None:
+    table = pictures / "lights.csv"
+    text = table.read_text()
+    table.write_text(f"{text}gone.png,0,0,1\n")
+    with pytest.raises(InputError, match=r"gone\.png"):
+        import_images(pictures, tmp_path / "capture", PERSON)
+    table.write_text("\n".join(text.splitlines()[:3]))
+    with pytest.raises(InputError, match="three lights"):
+        import_images(pictures, tmp_path / "capture", PERSON)
+
+
+def test_lights_in_a_plane_are_refused(tmp_path: Path) -> None:
+    angle = np.linspace(-0.8, 0.8, 6)
+    lights = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=1)
+    folder = tmp_path / "pictures"
+    write_table(folder / "lights.csv", write_pictures(folder, lights), lights)
+    import_images(folder, tmp_path / "capture", PERSON)
+    with pytest.raises(InputError, match="in a plane"):
+        ingested(tmp_path / "capture", tmp_path)
+
+
+def test_a_light_stage(tmp_path: Path) -> None:
+    """One camera by COLMAP's text model, pictures as LIGHT_CAMERA."""
+    source = tmp_path / "stage"
+    source.mkdir()
+    names = [f"L{k}" for k in range(len(LIGHTS))]
+    for name, light in zip(names, LIGHTS, strict=True):
+        write_frame(
+            source / f"{name}_front.png", encoded(radiance(light), "uint16", srgb=False)
+        )
+    write_table(source / "lights.csv", names, LIGHTS)
+    focal = 10_000
+    (source / "cameras.txt").write_text(
+        f"# id\n1 PINHOLE 48 48 {focal} {focal} 24 24\n"
+    )
+    # turned by 180 degrees about x: y up, z to the camera
+    (source / "images.txt").write_text("# id\n1 0 1 0 0 0 0 10000 1 front.png\n1 2 3\n")
+    result = import_olat(source, tmp_path / "capture", PERSON)
+    assert result.notes[0] == "pictures are {light}_{camera}.png"
+    tree = ingested(tmp_path / "capture", tmp_path)
+    truth = true_normals(tree)
+    inner = truth[:, 2] > 0.5
+    miss = angle(tree["surfels"]["surfel_normal"].values, truth)[inner]
+    assert np.median(miss) < 3
+    (source / "L4_front.png").unlink()
+    with pytest.raises(InputError, match="none of light L4, camera front"):
+        import_olat(source, tmp_path / "again", PERSON)
+
+
+def test_several_cameras_need_a_scan(pictures: Path, tmp_path: Path) -> None:
+    import_images(pictures, tmp_path / "capture", PERSON)
+    path = tmp_path / "capture/dome/dome.json"
+    dome = json.loads(path.read_text())
+    dome["cameras"].append(dome["cameras"][0] | {"id": "c01"})
+    for frame in (tmp_path / "capture/dome/frames").glob("*_c00.png"):
+        frame.with_name(frame.name.replace("c00", "c01")).write_bytes(
+            frame.read_bytes()
+        )
+    path.write_text(json.dumps(dome))
+    with pytest.raises(InputError, match="photogrammetry"):
+        read_capture(tmp_path / "capture")
