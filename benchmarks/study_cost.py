@@ -29,7 +29,8 @@ import skindb
 from skindb.analysis import STUDIES
 from skindb.store import Database
 from skindb.workflow import register_takes, study
-from skindb.workflow.derive import groups_of
+from skindb.workflow.cohorts import model_with_summary, summary_parameters
+from skindb.workflow.derive import TABLES, groups_of
 
 # brdf needs captures, of which there are none
 STEPS = ("register", *(name for name in STUDIES if name != "brdf"))
@@ -82,7 +83,6 @@ def grow(source: Database, target: Database, takes: int, subdivide: int) -> None
     for number in range(len(target.takes("model")), takes):
         model = source.read("model", names[number % len(names)]).load()
         groups = groups_of(model)
-        groups.pop("sample", None)
         for _ in range(subdivide):
             groups = subdivided(groups)
         scaled = groups["fitted"]["diffuse_reflectance"] * np.exp(
@@ -102,9 +102,13 @@ def grow(source: Database, target: Database, takes: int, subdivide: int) -> None
             "traits": traits,
             "consent_scope": ["fit", "statistics"],
         }
+        summarised = groups_of(model_with_summary(xr.DataTree.from_dict(groups)))
+        tables = summarised.pop(TABLES)
+        attributes |= {"take": take, "inputs": []}
+        attributes["summary_parameters"] = summary_parameters()
         with target.stage("model", take) as stage:
-            stage.write(groups)
-            stage.commit({**model.attrs, **attributes, "take": take, "inputs": []})
+            stage.write(summarised, tables=tables)
+            stage.commit(model.attrs | attributes)
 
 
 def measure(url: str, step: str, takes: int) -> None:

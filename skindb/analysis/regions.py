@@ -182,12 +182,17 @@ def _corners(
 
 def inside_outline(points: Array, outline: Array) -> Mask:
     """Whether points (n, 2) lie inside a closed outline (m, 2), by the even-odd rule."""
-    inside = np.zeros(len(points), bool)
-    x = points[:, 0]
-    y = points[:, 1]
+    x, y = points.T
+    left, top = outline.min(axis=0)
+    right, bottom = outline.max(axis=0)
+    near = np.flatnonzero((x >= left) & (x <= right) & (y >= top) & (y <= bottom))
+    x, y = points[near].T
+    within = np.zeros(len(near), bool)
     for (ax, ay), (bx, by) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
         if ay != by:
-            inside ^= ((ay > y) != (by > y)) & (
+            within ^= ((ay > y) != (by > y)) & (
                 x < ax + (y - ay) / (by - ay) * (bx - ax)
             )
+    inside = np.zeros(len(points), bool)
+    inside[near] = within
     return inside

@@ -2,7 +2,7 @@
 sample of surfels.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -376,7 +376,11 @@ def _samples_of(capture: xr.DataTree, index: Index) -> xr.Dataset:
 
 
 def common_maps(
-    model: xr.DataTree, registered: xr.Dataset, *, size: int = SIZE
+    model: xr.DataTree,
+    registered: xr.Dataset,
+    *,
+    size: int = SIZE,
+    maps: Collection[str] | None = None,
 ) -> xr.Dataset:
     """Albedo, surface reflectance and translucency of one take as maps in the common (u, v).
 
@@ -389,6 +393,8 @@ def common_maps(
     size
         Texels along each side; texel (i, j) has its centre at v = (i + 0.5) / size, u =
         (j + 0.5) / size.
+    maps
+        Variables of the result, by default all.
 
     Returns
     -------
@@ -398,17 +404,18 @@ def common_maps(
         is trusted, and why not) and `texel_coverage`. Inside the face, values that were
         not measured are interpolated from the surrounding texels; outside they are NaN.
     """
-    fitted = model["fitted"].to_dataset().load()
+    fitted = model["fitted"].to_dataset()
     triangles = model["mesh"].to_dataset()[variables.TRIANGLE].values
     uv = registered[variables.COMMON_UV].values
     codes = surfel_texels(fitted)
     raster = rasterise_atlas(uv, triangles, size)
     status = texel_codes(codes, triangles, *raster)
     outside = status == TexelStatus.OUTSIDE
-    maps: dict[str, np.ndarray] = {}
     coverage = np.zeros((size, size), np.float32)
+    found = {variables.TEXEL_STATUS: status, variables.TEXEL_COVERAGE: coverage}
     for name in names_of(Use.MAPPED):
-        if name not in fitted:
+        needed = maps is None or f"texel_{name}" in maps
+        if name not in fitted or not (needed or name == variables.DIFFUSE_REFLECTANCE):
             continue
         values = fitted[name].values.reshape(len(codes), -1).astype(np.float32)
         trust = (
@@ -417,14 +424,12 @@ def common_maps(
         image, weight = atlas_values(
             np.nan_to_num(values), trust, uv, triangles, raster
         )
+        if name == variables.DIFFUSE_REFLECTANCE:
+            coverage[:] = np.where(outside, np.float32(0), weight)
         filled = (
             push_pull(image, weight)[0] if trust.any() else np.full_like(image, np.nan)
         )
-        filled = np.where(outside[..., None], np.float32(np.nan), filled)
-        maps[f"texel_{name}"] = filled if fitted[name].ndim == 2 else filled[..., 0]
-        if name == variables.DIFFUSE_REFLECTANCE:
-            coverage = np.where(outside, np.float32(0), weight)
-    return dataset(
-        maps | {variables.TEXEL_STATUS: status, variables.TEXEL_COVERAGE: coverage},
-        coords={"channel": ["R", "G", "B"]},
-    )
+        filled[outside] = np.nan
+        found[f"texel_{name}"] = filled if fitted[name].ndim == 2 else filled[..., 0]
+    chosen = {name: found[name] for name in found if maps is None or name in maps}
+    return dataset(chosen, coords={"channel": ["R", "G", "B"]})

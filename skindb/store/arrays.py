@@ -6,7 +6,7 @@ dimension), so that each chunk is decompressed where its values belong. All othe
 and all other programs, read them by zarr.
 """
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -110,20 +110,27 @@ class ShardedArray(BackendArray):
                 values[:] = chunk[(a - low) * row : (b - low) * row]
 
 
-def open_version(place: Place, record: Record) -> xr.DataTree:
-    """A version as a lazy DataTree, in blocks of 4,096 surfels where it has samples, and
-    of whole objects elsewhere.
+def open_version(
+    place: Place, record: Record, groups: Sequence[str] | None = None
+) -> xr.DataTree:
+    """A version, or some groups of it, as a lazy DataTree, in blocks of 4,096 surfels
+    where it has samples, and of whole objects elsewhere.
     """
-    store = VerifiedStore(place, record)
-    # chunks={} would use the inner chunks, which gives sixteen times as many tasks
-    tree = xr.open_datatree(store, engine="zarr", consolidated=True, chunks=None)  # type: ignore[arg-type]
-    groups = {
-        path: _lazy(store, path.strip("/"), node.to_dataset(inherit=False))
-        for path, node in tree.subtree_with_keys
-    }
-    lazy = xr.DataTree.from_dict(groups)
-    lazy.attrs = {**tree.attrs, "generation": record.generation}
-    return lazy
+    if groups is not None:
+        lazy = {name: open_group(place, record, name) for name in groups}
+        attrs: Mapping[Any, Any] = record.provenance
+    else:
+        store = VerifiedStore(place, record)
+        # chunks={} would use the inner chunks, which gives sixteen times as many tasks
+        tree = xr.open_datatree(store, engine="zarr", consolidated=True, chunks=None)  # type: ignore[arg-type]
+        lazy = {
+            path: _lazy(store, path.strip("/"), node.to_dataset(inherit=False))
+            for path, node in tree.subtree_with_keys
+        }
+        attrs = tree.attrs
+    version = xr.DataTree.from_dict(lazy)
+    version.attrs = {**attrs, "generation": record.generation}
+    return version
 
 
 def open_group(place: Place, record: Record, group: str) -> xr.Dataset:

@@ -59,6 +59,7 @@ class CohortRequest:
     size: int = 512
     seed: int = 0
     digest: str = ""  # of the code that computed the summary; empty for any
+    maps: tuple[str, ...] | None = None  # variables of the maps; by default all
 
 
 @dataclass(frozen=True)
@@ -323,6 +324,11 @@ def _stored_record(
     """The record of the version with the data for a cohort: the given one, or a summary
     of it; None if neither.
     """
+    if request.layout == "maps":
+        # a summary may have some of the maps; all are those of the registration
+        stored = record.contents.get("maps", NO_CONTENTS)["variables"]
+        names = stored if request.maps is None else request.maps
+        request = replace(request, maps=tuple(name for name in names if name in stored))
     for summary in reversed(lookup.history(SUMMARY, record.take)):
         sources = [(i["kind"], i["generation"], i["seal"]) for i in summary.made_from]
         if (record.kind, record.generation, record.seal) in sources and _has_data_for(
@@ -353,7 +359,10 @@ def _has_data_for(record: Record, request: CohortRequest) -> bool:
         return int(parameters.get("seed", 0)) == request.seed and (
             count >= request.surfels or is_complete
         )
-    return request.layout == "tables" or contents["sizes"]["u"] == request.size
+    return request.layout == "tables" or (
+        contents["sizes"]["u"] == request.size
+        and set(request.maps or ()) <= set(contents["variables"])
+    )
 
 
 def _parts(

@@ -226,6 +226,7 @@ class Database:
         *,
         generation: int | None = None,
         release: str | None = None,
+        groups: Sequence[str] | None = None,
     ) -> xr.DataTree:
         """A version as a lazy DataTree, in blocks of 4,096 surfels.
 
@@ -239,6 +240,8 @@ class Database:
             Generation of the version, by default the newest.
         release
             Name of a release, to read the version that it names.
+        groups
+            Groups that are opened, by default all.
 
         Returns
         -------
@@ -260,7 +263,7 @@ class Database:
         else:
             snapshot = Snapshot(self.place)
             record = pinned_record(snapshot, pins_of(snapshot, release), kind, take)
-        version = open_version(self.place, record)
+        version = open_version(self.place, record, groups)
         if kind not in INFO_SECTIONS:
             version.attrs |= self._consent_of(take)
         return version
@@ -386,11 +389,12 @@ class Database:
         is_cached &= takes is None or len(takes) > FEW_TAKES
         lookup = Lookup(self, release, RecordCache(self.place) if is_cached else None)
         lookup.read_ahead(CACHED_KINDS)
+        chosen = None if variables is None else tuple(variables)
         combined = cohort(
             lookup,
-            CohortRequest(layout, surfels, size, seed),
+            CohortRequest(layout, surfels, size, seed, maps=chosen),
             kind=kind,
-            variables=variables,
+            variables=chosen,
             takes=takes,
             dim=dim,
         )
@@ -445,10 +449,14 @@ class Database:
         return commit_release(self.place, name, pins)
 
     def source(
-        self, version: xr.DataTree, kind: str = "capture", take: str | None = None
+        self,
+        version: xr.DataTree,
+        kind: str = "capture",
+        take: str | None = None,
+        groups: Sequence[str] | None = None,
     ) -> xr.DataTree:
         """The input of this kind, and of this take if one is given, from which a
-        version was made.
+        version was made, or some groups of it.
         """
         title = str(version.attrs.get("take", "version"))
         for made_from in version.attrs.get("inputs", []):
@@ -462,7 +470,10 @@ class Database:
                     "compute the version again",
                 )
                 return self.read(
-                    kind, made_from["take"], generation=made_from["generation"]
+                    kind,
+                    made_from["take"],
+                    generation=made_from["generation"],
+                    groups=groups,
                 )
         raise input_error(
             title,

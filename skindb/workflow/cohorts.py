@@ -45,6 +45,8 @@ from skindb.workflow.takes import Result, map_takes, results_of
 if TYPE_CHECKING:
     from distributed import Client
 
+SURFACE = ("fitted", "mesh")  # groups of a model that maps and registrations need
+
 
 @logged("summarise")
 def summarise(
@@ -54,6 +56,7 @@ def summarise(
     surfels: int = SAMPLED,
     seed: int = 0,
     size: int = SIZE,
+    maps: Sequence[str] | None = None,
     workers: int | None = None,
     release: str | None = None,
 ) -> list[str]:
@@ -73,6 +76,8 @@ def summarise(
         Number of surfels of the samples, and their random seed.
     size
         Texels along each side of the maps, for takes that are registered.
+    maps
+        Variables of the maps, by default all.
     workers
         See `map_takes`.
     release
@@ -93,24 +98,25 @@ def summarise(
     tables = CohortRequest("tables", digest=code)
     sample = CohortRequest("surfels", surfels=surfels, seed=seed, digest=code)
     lookup = Lookup(db, release)
-    maps = CohortRequest("maps", size=size, digest=code)
-    models = [
-        lookup.record("model", take)
-        for take in lacking(db, "model", [tables, sample], names, release=release)
-    ]
+    chosen = None if maps is None else tuple(maps)
+    map_request = CohortRequest("maps", size=size, digest=code, maps=chosen)
+    lookup = Lookup(db, release)
     registered = [take for take in names if lookup.has("registration", take)]
-    lack = lacking(db, "registration", [maps, sample], registered, release=release)
-    frames = [lookup.record("registration", take) for take in lack]
-    records = list(
-        results_of(
-            map_takes(partial(_summarise_model, db, sample), models, workers=workers)
-        )
-    )
-    records += results_of(
-        map_takes(
-            partial(_summarise_registration, db, sample, size), frames, workers=workers
-        )
-    )
+    steps: list[tuple[str, list[str], list[CohortRequest], Callable[..., Record]]] = [
+        ("model", names, [tables, sample], partial(_summarise_model, db, sample)),
+        (
+            "registration",
+            registered,
+            [sample],
+            partial(_summarise_registration, db, sample, size),
+        ),
+        ("registration", registered, [map_request], partial(_map, db, map_request)),
+    ]
+    records: list[Record] = []
+    for kind, candidates, requests, summary in steps:
+        lack = lacking(db, kind, requests, candidates, release=release)
+        versions = [lookup.record(kind, take) for take in lack]
+        records += results_of(map_takes(summary, versions, workers=workers))
     return sorted({record.take for record in records})
 
 
@@ -199,12 +205,30 @@ def _summarise_model(db: Database, sample: CohortRequest, record: Record) -> Rec
 def _summarise_registration(
     db: Database, sample: CohortRequest, size: int, record: Record
 ) -> Record:
-    version = db.read("registration", record.take, generation=record.generation)
-    model = db.source(version, "model", record.take)
-    registered = version["registration"].to_dataset()
     options = {"surfels": sample.surfels, "seed": sample.seed, "size": size}
+    model, registered = _registered_model(db, record)
     groups = registered_parts(model, registered, **options)
     return _commit_summary(db, record, groups, summary_parameters(**options))
+
+
+def _map(db: Database, request: CohortRequest, record: Record) -> Record:
+    model, registered = _registered_model(db, record)
+    maps = common_maps(model, registered, size=request.size, maps=request.maps)
+    return _commit_summary(
+        db, record, {"maps": maps}, summary_parameters(size=request.size)
+    )
+
+
+def _registered_model(db: Database, record: Record) -> tuple[xr.DataTree, xr.Dataset]:
+    """The model of a registration, and the group "registration"."""
+    version = db.read(
+        "registration",
+        record.take,
+        generation=record.generation,
+        groups=["registration"],
+    )
+    model = db.source(version, "model", record.take, SURFACE)
+    return model, version["registration"].to_dataset()
 
 
 def _commit_summary(
@@ -399,7 +423,9 @@ def registered_datasets(
     """The group "registration" of versions; what belongs to no surfel is in memory."""
     out = {}
     for take, record in records.items():
-        version = db.read("registration", take, generation=record.generation)
+        version = db.read(
+            "registration", take, generation=record.generation, groups=["registration"]
+        )
         ds = version["registration"].to_dataset()
         small = {name: ds[name].load() for name in ds if "surfel" not in ds[name].dims}
         out[take] = ds.assign(small)
@@ -409,7 +435,7 @@ def registered_datasets(
 def _outline(
     db: Database, generations: Mapping[str, int], take: str
 ) -> tuple[str, tuple[str, ...], Outline]:
-    model = db.read("model", take, generation=generations[take])
+    model = db.read("model", take, generation=generations[take], groups=SURFACE)
     points = landmark_names([model])
     return take, points, outline(model, points)
 
@@ -418,7 +444,7 @@ def _register(
     derivation: Derivation, generations: Mapping[str, int], frame: Frame, take: str
 ) -> Record:
     model, template = (
-        derivation.db.read("model", name, generation=generations[name])
+        derivation.db.read("model", name, generation=generations[name], groups=SURFACE)
         for name in (take, frame.template)
     )
     registered = register_one(take, model, template, frame)
@@ -429,11 +455,11 @@ def _register(
 
 
 def _has_landmarks(db: Database, record: Record) -> bool:
-    if record.contents and variables.LANDMARK_POSITION not in record.contents.get(
-        "mesh", {}
-    ).get("variables", []):
+    mesh = record.contents.get("mesh", {"variables": []})
+    if variables.LANDMARK_POSITION not in mesh["variables"]:
         return False
-    return has_landmarks(db.read("model", record.take, generation=record.generation))
+    model = db.read("model", record.take, generation=record.generation, groups=["mesh"])
+    return has_landmarks(model)
 
 
 # functions that compute what cohorts need

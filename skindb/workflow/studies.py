@@ -104,11 +104,15 @@ def open_population(
     else:
         cohort = open_models("tables")
     registrations: Mapping[str, Record] = {}
+    frames: dict[str, xr.Dataset] = {}
     notes: list[Note] = []
     if study.registers:
         if not takes:  # before anything is registered
             require_same_fit(cohort)
-        registrations, notes = _registrations(db, cohort, release)
+        registrations, origin = _registrations(db, cohort, release)
+        frames = registered_datasets(db, registrations)
+        notes = describe_registration(frames, cohort["take"].values.tolist())
+        notes += [note("", origin)] if frames else []
     registered = [*registrations]
     open_registered = partial(db.cohort, takes=registered, release=release)
 
@@ -116,7 +120,8 @@ def open_population(
         if layout != "maps" and "kind" not in options:
             return open_models(layout, **options)
         size = {"size": options["size"]} if "size" in options else {}
-        summarise(db, registered, release=release, **size)
+        maps = options.get("variables") if layout == "maps" else None
+        summarise(db, registered, release=release, maps=maps, **size)
         return open_registered(layout, **options)
 
     if study.layout == "maps":
@@ -126,7 +131,7 @@ def open_population(
         cohort,
         open_cohort,
         partial(_brdf_tables, open_models, cohort, dictionary),
-        landmarks=common_landmarks(registered_datasets(db, registrations)),
+        landmarks=common_landmarks(frames),
         registered=registered,
         mixed_fits=bool(takes),
         notes=notes,
@@ -218,9 +223,9 @@ def require_covered(db: Database, release: str | None) -> None:
 
 def _registrations(
     db: Database, cohort: xr.Dataset, release: str | None
-) -> tuple[dict[str, Record], list[Note]]:
-    """Registrations of the takes of a cohort that can have one, and notes on them; a
-    release is never registered again.
+) -> tuple[dict[str, Record], str]:
+    """Registrations of the takes of a cohort that can have one, and where they are
+    from; a release is never registered again.
     """
     takes = cohort["take"].values.tolist()
     if release is not None:
@@ -237,8 +242,7 @@ def _registrations(
             everyone = register_takes(db)
             records = {take: everyone[take] for take in everyone if take in able}
             origin = "made for this study"
-    notes = describe_registration(registered_datasets(db, records), takes)
-    return records, [*notes, note("", origin)] if records else notes
+    return records, origin
 
 
 @on_one_blas_thread

@@ -37,6 +37,12 @@ def test_read__gives_back_what_was_written(tmp_path):
     assert tree.attrs["seeds"] == [1]
     assert tree.attrs["schema_version"] == SCHEMA_VERSION
     assert tree.attrs["software_version"] == skindb.__version__
+    part = Database(tmp_path).read("capture", "A1", groups=["surfels"])
+    assert list(part.children) == ["surfels"]
+    xr.testing.assert_identical(
+        part["surfels"].to_dataset().compute(), tree["surfels"].to_dataset().compute()
+    )
+    assert part.attrs == tree.attrs
     # without skindb
     plain = xr.open_datatree(tmp_path / record.path, engine="zarr", consolidated=False)
     assert float(plain["surfels/surfel_area"][1]) == 0.5

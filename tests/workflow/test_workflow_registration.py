@@ -21,7 +21,7 @@ from skindb.analysis.registration import register, tabulate_registration
 from skindb.cli import cli
 from skindb.errors import InputError
 from skindb.schema.notes import note, note_lines
-from skindb.store import Database
+from skindb.store import SUMMARY, Database
 from skindb.workflow.cohorts import (
     current_registrations,
     registered_datasets,
@@ -123,6 +123,24 @@ def test_register_takes__maps_of_the_common_coordinates(tmp_path):
         db.cohort("maps", size=64)
     assert workflow.summarise(db, size=64) == ["A", "B"]
     assert db.cohort("maps", size=64).sizes["u"] == 64
+
+
+def test_summarise__some_maps_and_then_all(tmp_path):
+    db = _stored(tmp_path, sheet_pair())
+    workflow.register_takes(db, reference="A")
+    some = ["texel_diffuse_reflectance", "texel_coverage"]
+    assert workflow.summarise(db, size=32, maps=some) == ["A", "B"]
+    stored = db.read(SUMMARY, "A")
+    assert list(stored.children) == ["maps"]
+    assert set(stored["maps"].data_vars) == set(some)
+    few = db.cohort("maps", size=32, variables=some).load()
+    assert workflow.summarise(db, size=32, maps=some[:1]) == []
+    with pytest.raises(InputError, match=r"maps of 32 texels.*summarise"):
+        db.cohort("maps", size=32)
+    assert workflow.summarise(db, size=32) == ["A", "B"]
+    every = db.cohort("maps", size=32)
+    assert set(every.data_vars) == set(db.cohort("maps").data_vars)
+    xr.testing.assert_identical(every[some].load(), few)
 
 
 def _replace(
