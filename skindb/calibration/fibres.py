@@ -233,12 +233,9 @@ class Spots:
 
 @dataclass(frozen=True)
 class SpotOffsets:
-    """Found minus given centres (fibre, 2) px, ratio of the radii (fibre,), and index
-    of the found spot (fibre,).
-    """
+    """Found minus given centres (fibre, 2) px, and index of the found spot (fibre,)."""
 
     offset: Float64
-    radius_ratio: Float64
     order: Index
 
 
@@ -344,8 +341,7 @@ def match_fibres(spots: Spots, stated: Spots) -> SpotOffsets:
         f"{count} farther away, up to {distance.max():.1f} px",
         "correct the centres",
     )
-    ratio = spots.radius[order] / stated.radius
-    return SpotOffsets(offset, ratio, np.asarray(order, int))
+    return SpotOffsets(offset, np.asarray(order, int))
 
 
 def fibre_gain(signal: ArrayLike) -> FibreGain:

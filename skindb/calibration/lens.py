@@ -29,16 +29,14 @@ class EdgeFit:
     """Blur of an edge: standard deviation in px, which includes the aperture of the
     pixel, with its standard error.
 
-    `dark` and `bright` are the levels beside the edge, `slant` its columns per row, and
-    `mtf50` the frequency in cycles per px at which a Gaussian of this width halves the
-    contrast.
+    `dark` and `bright` are the levels beside the edge, and `mtf50` the frequency in cycles
+    per px at which a Gaussian of this width halves the contrast.
     """
 
     blur: float
     blur_error: float
     dark: float
     bright: float
-    slant: float
 
     @property
     def mtf50(self) -> float:
@@ -90,7 +88,7 @@ def fit_edge(picture: ArrayLike) -> EdgeFit:
             [np.inf, 1, EDGE_REACH_PX, np.inf, np.inf],
         ),
     )
-    _, slant, blur, dark, contrast = map(float, fit.x)
+    blur, dark, contrast = map(float, fit.x[2:])
     variance = 2 * fit.cost / max(len(value) - 5, 1)
     noise = np.sqrt(variance)
     _require_edge(
@@ -98,7 +96,7 @@ def fit_edge(picture: ArrayLike) -> EdgeFit:
         f"a contrast of {contrast:.3g} over noise of {noise:.3g}",
     )
     error = np.sqrt(variance * np.linalg.pinv(fit.jac.T @ fit.jac)[2, 2])
-    return EdgeFit(blur, float(error), dark, dark + contrast, slant)
+    return EdgeFit(blur, float(error), dark, dark + contrast)
 
 
 def veiling_glare(edge: EdgeFit, *, mean: float, contrast: float = 0.0) -> float:

@@ -66,16 +66,6 @@ class Outline:
 
 
 @dataclass(frozen=True)
-class BallCentre:
-    """Centre (3,) mm of a ball, and largest relative mismatch of its size in the
-    pictures; NaN for one camera.
-    """
-
-    centre: Float64
-    mismatch: float
-
-
-@dataclass(frozen=True)
 class LightPosition:
     """Position (3,) mm, its covariance (3, 3) mm2, and the angle (ray,) in degrees by
     which each ray misses it.
@@ -219,8 +209,8 @@ def reflected_ray(
 
 def ball_centre(
     cameras: Sequence[Pinhole], outlines: ArrayLike, radius: float
-) -> BallCentre:
-    """Centre of a ball of known radius from its outlines in one or more calibrated cameras.
+) -> Float64:
+    """Centre (3,) mm of a ball of known radius from its outlines in one or more calibrated cameras.
 
     The lines of sight to the outline form a cone, whose axis points to the centre and
     whose angle gives the distance. With several cameras, the centre is where their axes
@@ -253,7 +243,7 @@ def ball_centre(
         distances.append(radius / np.sqrt(1 - min(1 / length**2, 1 - 1e-12)))
     start = np.array([camera.centre for camera in cameras])
     if len(cameras) == 1:
-        return BallCentre(start[0] + distances[0] * directions[0], np.nan)
+        return np.asarray(start[0] + distances[0] * directions[0])
     centre = light_position(start, directions).position
     ratio = np.linalg.norm(centre - start, axis=1) / np.array(distances)
     mismatch = float(np.abs(ratio - 1).max())
@@ -265,7 +255,7 @@ def ball_centre(
         f"{mismatch:.0%} off",
         "give the radius of the ball in mm, and column, row and radius of its outlines in px",
     )
-    return BallCentre(centre, mismatch)
+    return centre
 
 
 def light_position(origins: ArrayLike, directions: ArrayLike) -> LightPosition:
@@ -515,7 +505,7 @@ def calibrate_positions(dome: DomeRecord, ball: BallFrames) -> xr.Dataset:
         )
         if centre is None:
             raise InputError(faults)
-        centres[place] = centre.centre
+        centres[place] = centre
 
     def calibrated(light: LightRecord) -> tuple[LightPosition, int]:
         rays = list(_rays(dome, ball, centres, light))

@@ -83,17 +83,13 @@ class Response:
 
     `table` (row, 4) holds the values of the file and the relative exposures of red,
     green and blue, from 0 at black to 1 at white. `residual` (3,) is the root mean
-    square of the misfit in natural logarithms, weighted as in the fit. `covered` (3, 2)
-    are the lowest and highest value (0 black, 1 white) of a sample; the response is
-    extrapolated beyond them. `samples` (3,) counts those that were used. `was_rising`
-    (3,) is False where the fit fell somewhere, and the table is its running maximum.
+    square of the misfit in natural logarithms, weighted as in the fit. `samples`
+    (3,) counts those that were used; beyond their values the response is extrapolated.
     """
 
     table: Float64
     residual: Float64
-    covered: Float64
     samples: Index
-    was_rising: Mask
 
     @property
     def nonlinearity(self) -> float:
@@ -169,17 +165,13 @@ def recover_response(
     # forced to rise from 0 at black to 1 at white
     value = np.linspace(0.0, 1.0, TABLE_ROWS)
     fits = [_fit_channel(samples, options) for samples in channels]
-    curves = [_curve(value, log_ratio, options.knots) for log_ratio, _, _ in fits]
-    rising = [_rising(curve) for curve in curves]
-    usable = [samples.value[samples.usable] for samples in channels]
+    rising = [_rising(_curve(value, ratio, options.knots)) for ratio, _, _ in fits]
     return Response(
         table=np.column_stack(
             [black + value * (white - black), *(curve / curve[-1] for curve in rising)]
         ),
         residual=np.array([residual for _, residual, _ in fits]),
-        covered=np.array([[values.min(), values.max()] for values in usable]),
         samples=np.array([count for _, _, count in fits], int),
-        was_rising=np.array([(np.diff(curve) > 0).all() for curve in curves]),
     )
 
 

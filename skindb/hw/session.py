@@ -14,13 +14,11 @@ from skindb.hw.link import DeviceError, RefusedError
 from skindb.hw.probe import PRESSURE_KPA, Placement, PlacementError, Probe, Reading
 from skindb.hw.sequence import (
     DARK,
-    Assessment,
     Measured,
     Override,
     Rehearsal,
     Schedule,
     Step,
-    assess,
     partial_schedule,
     require_safe,
 )
@@ -49,7 +47,6 @@ class DomeRun:
     """Frames and measured steps of a capture, complete or not."""
 
     schedule: Schedule
-    assessment: Assessment
     measured: list[Measured | None]
     # camera, step -> file
     frames: dict[tuple[str, int], Path] = field(default_factory=dict)
@@ -134,9 +131,8 @@ def capture_dome(
         and the frames captured so far are kept.
     """
     report = progress or silent
-    run = DomeRun(
-        schedule, require_safe(schedule, override), [None] * len(schedule.steps)
-    )
+    require_safe(schedule, override)
+    run = DomeRun(schedule, [None] * len(schedule.steps))
     clock = dome.link.clock
     remaining = list(range(len(schedule.steps)))
     begin_time = 0.0  # when the first run began
@@ -196,7 +192,7 @@ def recover_run(
         return None
     dome.stop()
     cameras.start(started)
-    run = DomeRun(schedule, assess(schedule), [None] * len(schedule.steps))
+    run = DomeRun(schedule, [None] * len(schedule.steps))
     reports = StepReports()
     reports.read(dome, schedule)
     _collect(run, cameras, range(len(schedule.steps)), schedule, reports)
