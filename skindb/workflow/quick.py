@@ -16,6 +16,7 @@ from skindb.files import make_private, private_umask
 from skindb.format.fields import NAME, read_json
 from skindb.geometry.camera import project
 from skindb.ingest.pictures import Response, import_images
+from skindb.optics.fresnel import fresnel_transmittance
 from skindb.render.image import write_exr, write_png
 from skindb.schema import FitStatus
 from skindb.store.database import Database
@@ -53,6 +54,8 @@ def quick(
     out
         Folder to write: normals, albedo and gloss as .png and .exr, and page.html.
         Normals are in the frame of the picture: x to the right, y up, z to the camera.
+        Albedo is the fraction of light along the normal that is reflected in total,
+        gloss the part of the surface; both are relative.
         It must not hold these files.
 
     Returns
@@ -123,8 +126,10 @@ def _write_maps(model: xr.DataTree, out: Path, step: int) -> dict[str, Any]:
         return out
 
     normal = grid(fitted["shading_normal"].values @ lens[1].T * [1, -1, -1])
-    albedo = grid(fitted["diffuse_reflectance"].values)
     gloss = grid(fitted["surface_reflectance"].values[:, None])
+    # one camera determines the sum better than its parts: wide lobes look like R_d
+    passed = _transmitted(float(fitted["refractive_index"]))
+    albedo = passed * grid(fitted["diffuse_reflectance"].values) + gloss
     pictures = {
         "normals": (normal, (normal + 1) / 2),
         "albedo": (albedo, _shown(albedo)),
@@ -146,6 +151,13 @@ def _write_maps(model: xr.DataTree, out: Path, step: int) -> dict[str, Any]:
         },
         "normal_error": float(np.nanmedian(error)) if error.size else None,
     }
+
+
+def _transmitted(eta: float) -> float:
+    """Fraction of the diffuse light along the normal that passes the boundary twice."""
+    cosine = (np.arange(200) + 0.5) / 200
+    leaves = 2 * np.mean(fresnel_transmittance(cosine, eta) * cosine)
+    return float(fresnel_transmittance(np.ones(1), eta)[0] * leaves)
 
 
 def _shown(values: Float64) -> Float64:
