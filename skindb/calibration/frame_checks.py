@@ -113,23 +113,22 @@ def view_faults(
     return [] if fault is None else [replace(fault, found=view + fault.found)]
 
 
-def checked_view(
+def checked_white_view(
     dome: DomeRecord,
     light: str,
     merger: FrameMerger,
     *,
-    white: bool = False,
     digests: Digests | None = None,
 ) -> list[Frame]:
-    """Decode the exposures of one light and camera.
+    """Decode the exposures of the white target under one light.
 
     Raises
     ------
     InputError
         With every frame that cannot be decoded, or the fault of the view.
     """
-    frames = read_view(dome, light, merger.camera, white=white, digests=digests)
-    if faults := view_faults(dome, light, merger, frames, white=white):
+    frames = read_view(dome, light, merger.camera, white=True, digests=digests)
+    if faults := view_faults(dome, light, merger, frames, white=True):
         raise InputError(faults)
     return frames
 

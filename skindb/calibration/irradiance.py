@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from skindb.calibration._merge_kernels import OK
-from skindb.calibration.frame_checks import checked_view
+from skindb.calibration.frame_checks import checked_white_view
 from skindb.calibration.radiance import FrameMerger
 from skindb.errors import attempt_all, require
 from skindb.format.dome import CameraRecord, DomeRecord, LightRecord, WhiteRecord
@@ -184,7 +184,7 @@ def _intensities(
     white = dome.white
     if white is None or not len(target.at):
         return np.zeros((0, 3))
-    frames = checked_view(dome, light.id, merger, white=True, digests=digests)
+    frames = checked_white_view(dome, light.id, merger, digests=digests)
     radiance, flag = merger.merge(frames, target.spans)
     square, falloff = light_falloff(light, target.points)
     towards = (light.position - target.points) @ white.normal

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from skindb.calibration._merge_kernels import OK, SATURATED
-from skindb.calibration.frame_checks import checked_view
+from skindb.calibration.frame_checks import checked_white_view
 from skindb.calibration.irradiance import (
     TARGET_INTERIOR_FRACTION,
     LightFit,
@@ -431,7 +431,7 @@ def _pixels(
     points = [np.zeros((0, 3))]
     beside = [0.0]
     for view in views:
-        frames = checked_view(dome, light.id, view.merger, white=True)
+        frames = checked_white_view(dome, light.id, view.merger)
         merged, flag = view.merger.merge(frames)
         usable = flag.ravel()[view.target.at] == OK
         values = merged.reshape(-1, 3)[view.target.at].astype(float)

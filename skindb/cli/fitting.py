@@ -91,7 +91,7 @@ def fit(
     chosen = takes or workflow.takes_to_fit(
         database, refit=refit, changes=changes, dictionary=dictionary
     )
-    for take in [] if takes else workflow.takes_without_consent(database, "fit"):
+    for take in [] if takes else workflow.takes_without_consent(database):
         echo(f"skipped: {take}: its consent does not cover fits", err=True)
     _report_kept(database, chosen, changes)
     how = partial(

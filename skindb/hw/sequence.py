@@ -105,7 +105,6 @@ def plan_schedule(
     exposures: Mapping[str, float],
     *,
     seconds: float | None = None,
-    period: float = 0.0,
 ) -> Schedule:
     """Plan a sequence of single lights: all lights with one exposure, then with the next.
 
@@ -117,8 +116,6 @@ def plan_schedule(
         Id -> seconds.
     seconds
         Duration of the sequence; by default as short as the exposures allow.
-    period
-        Shortest time [s] from one light to the next.
 
     Raises
     ------
@@ -140,7 +137,7 @@ def plan_schedule(
             f"{exposures[bad[0]]} s for {bad[0]}",
             "",
         )
-    shortest = sum(max(exposures[name] + GAP_SECONDS, period) for _, name in pairs)
+    shortest = sum(exposures[name] + GAP_SECONDS for _, name in pairs)
     if seconds is not None and seconds < shortest - 1e-9:
         raise input_error(
             "sequence",
@@ -154,7 +151,7 @@ def plan_schedule(
     for light, name in pairs:
         on = round(start * 1e6)
         steps.append(Step(light, name, on, on + round(exposures[name] * 1e6)))
-        start += max(exposures[name] + GAP_SECONDS, period) + stretch
+        start += exposures[name] + GAP_SECONDS + stretch
     return Schedule(tuple(steps))
 
 

@@ -507,22 +507,20 @@ def _largest_p(statistic: Array, drawn: Iterator[Array], count: int) -> Array:
     return (exceeding + 1) / (count + 1)
 
 
-def classical_scaling(distance: Array, axes: int = 2) -> tuple[Array, Array, float]:
-    """Points whose distances approximate those of a matrix: principal coordinates
+def classical_scaling(distance: Array) -> tuple[Array, Array, float]:
+    """Points in a plane whose distances approximate those of a matrix: principal coordinates
     (Torgerson 1952, Gower 1966).
 
     Parameters
     ----------
     distance
         (n, n) symmetric.
-    axes
-        Number of dimensions of the map.
 
     Returns
     -------
     place, explained, error
-        Centred points (n, axes), with the largest entry of each axis positive; fraction
-        of the scatter along each axis (axes,); RMS difference between distances in the
+        Centred points (n, 2), with the largest entry of each axis positive; fraction
+        of the scatter along each axis (2,); RMS difference between distances in the
         map and those of the matrix, over the RMS distance.
     """
     n = len(distance)
@@ -531,13 +529,13 @@ def classical_scaling(distance: Array, axes: int = 2) -> tuple[Array, Array, flo
     variance, vectors = np.linalg.eigh((gram + gram.T) / 2)
     variance = np.maximum(variance[::-1], 0.0)
     total = variance.sum() or 1.0
-    variance = variance[:axes]
+    variance = variance[:2]
     scale = np.sqrt(np.where(variance > ROUNDING * total, variance, 0.0))
-    place = vectors[:, ::-1][:, :axes] * scale
+    place = vectors[:, ::-1][:, :2] * scale
     largest = place[np.abs(place).argmax(axis=0), np.arange(place.shape[1])]
     place = place * np.where(largest < 0, -1.0, 1.0)
-    place = np.pad(place, ((0, 0), (0, axes - place.shape[1])))
-    explained = np.pad(variance, (0, axes - len(variance))) / total
+    place = np.pad(place, ((0, 0), (0, 2 - place.shape[1])))
+    explained = np.pad(variance, (0, 2 - len(variance))) / total
     mapped = np.linalg.norm(place[:, None] - place[None], axis=-1)
     square = ((mapped - distance) ** 2).sum() / ((distance**2).sum() or 1.0)
     return place, explained, float(np.sqrt(square))

@@ -6,12 +6,14 @@ from numpy.typing import ArrayLike, NDArray
 from skindb.numerics import _nnls_kernels
 from skindb.types import Array, Mask
 
+# largest KKT residual, relative to max |M'r| after scaling columns to unit length
+TOLERANCE = 1e-10
+
 
 def solve_nnls(
     gram: ArrayLike,
     rhs: ArrayLike,
     *,
-    tolerance: float = 1e-10,
     warm: ArrayLike | None = None,
 ) -> tuple[Array, Array, NDArray[np.int32], Mask]:
     """Minimise |M x - r| over x >= 0 given M'M and M'r.
@@ -20,8 +22,6 @@ def solve_nnls(
     ----------
     gram, rhs
         (n, m, m) and (n, m); columns of any scale, zero and collinear ones included.
-    tolerance
-        Largest KKT residual, relative to max |M'r| after scaling columns to unit length.
     warm
         (n, m) non-negative warm start; zero by default.
 
@@ -44,6 +44,6 @@ def solve_nnls(
     met = np.zeros(len(b), bool)
     valid = np.isfinite(G).all(axis=(1, 2)) & np.isfinite(b + x).all(axis=1)
     finite = np.asarray(valid)
-    _nnls_kernels.solve_many(G, b, x, finite, tolerance, kkt, count, met)
+    _nnls_kernels.solve_many(G, b, x, finite, TOLERANCE, kkt, count, met)
     x[~finite] = np.nan
     return x, kkt, count, met

@@ -18,7 +18,6 @@ from skindb.reflectance._lumitexel_kernels import (
     FEW,
     FITTED,
     MIN_COSINE_SURFACE,
-    NO_FLOOR,
     PERCEPTUAL,
     JudgedErrors,
     Lumitexel,
@@ -290,7 +289,7 @@ def _lobe_errors(
     for r in range(count):
         for c in range(3):
             b.scattered[c, r] += x[STRENGTH] * lobe.value[r]
-    return relative_errors(b.scattered, b.sample, count, NO_FLOOR)
+    return relative_errors(count, b)
 
 
 @kernel

@@ -599,15 +599,13 @@ def _add_squares(
 
 
 @kernel
-def relative_errors(
-    predicted: Matrix32, measured: Matrix32, n: int, floor: float
-) -> tuple[float, float]:
-    """RMS error over RMS of `measured`, both (channels, >= n), linear and in cube-root
-    space; NaN if `measured` is zero.
+def relative_errors(n: int, b: Lumitexel) -> tuple[float, float]:
+    """RMS error over RMS of the first n samples, predicted in `b.scattered`, linear and in
+    cube-root space; NaN if they are zero.
     """
     sums = np.zeros(4)
-    for c in range(measured.shape[0]):
-        _add_squares(predicted[c][:n], measured[c][:n], np.float32(floor), sums)
+    for c in range(3):
+        _add_squares(b.scattered[c][:n], b.sample[c][:n], np.float32(NO_FLOOR), sums)
     if sums[1] > 0.0:
         return math.sqrt(sums[0] / sums[1]), math.sqrt(sums[2] / sums[3])
     return math.nan, math.nan
@@ -621,7 +619,7 @@ def add_surface(count: int, b: Lumitexel) -> tuple[float, float]:
     for c in range(3):
         for r in range(count):
             b.scattered[c, r] += b.surface[r]
-    return relative_errors(b.scattered, b.sample, count, NO_FLOOR)
+    return relative_errors(count, b)
 
 
 @kernel

@@ -158,9 +158,7 @@ class Truncation:
     worst: float
 
 
-def truncation_bound(
-    table: Table, reduced: Table, lift: Array, *, elevation: float = MIN_COSINE_SAMPLES
-) -> Truncation:
+def truncation_bound(table: Table, reduced: Table, lift: Array) -> Truncation:
     """Bound the error of mixtures sum_j x_j b_j, x >= 0, that are formed from reduced tables.
 
     Parameters
@@ -169,8 +167,6 @@ def truncation_bound(
         (nh, nd, np, m) b_j >= 0 on the nodes of a `TableGrid` [sr^-1].
     reduced, lift
         (nh, nd, np, r) and (r, m) from `reduce_dictionary`.
-    elevation
-        Cosine that both directions of a pair exceed, for `worst`.
 
     Notes
     -----
@@ -187,7 +183,7 @@ def truncation_bound(
     error = (table - reduced @ lift).astype(np.float32)
     if not error.any():
         return Truncation(0.0, 0.0)
-    above = nodes_above(TableGrid(*table.shape[:3]), elevation)
+    above = nodes_above(TableGrid(*table.shape[:3]), MIN_COSINE_SAMPLES)
     value = table[above]
     off = np.abs(error[above])
     ratio = np.divide(

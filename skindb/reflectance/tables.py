@@ -130,18 +130,21 @@ def brdf_metric(
     return gram
 
 
-def directional_albedo(table: NDArray[Any], cos_o: ArrayLike, *, n: int = 96) -> Array:
+NODES = 96  # of theta_h in `directional_albedo`
+
+
+def directional_albedo(table: NDArray[Any], cos_o: ArrayLike) -> Array:
     """Fraction (k, m) of the light from a direction that is reflected, for cosines (k,)
     of that direction.
 
     The integral is over half vectors, on a grid that is quadratic in theta_h to resolve
     narrow lobes.
     """
-    t, w = np.polynomial.legendre.leggauss(n)
+    t, w = np.polynomial.legendre.leggauss(NODES)
     t = (t + 1) / 2
     w = w / 2
     theta = t**2 * np.pi / 2
-    phi = (np.arange(2 * n) + 0.5) * np.pi / n
+    phi = (np.arange(2 * NODES) + 0.5) * np.pi / NODES
     a, b = np.meshgrid(theta, phi, indexing="ij")
     h = np.stack([np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), np.cos(a)], axis=-1)
     rows = []
@@ -154,7 +157,7 @@ def directional_albedo(table: NDArray[Any], cos_o: ArrayLike, *, n: int = 96) ->
             * np.maximum(cos_d, 0)
             * np.sin(a)
             * (w * t * np.pi)[:, None]
-            * (np.pi / n)
+            * (np.pi / NODES)
         )
         weight = np.where(wi[..., 2] > 0, jacobian * wi[..., 2], 0.0)
         rows.append(

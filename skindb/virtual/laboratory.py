@@ -150,7 +150,7 @@ class Laboratory:
             len(self._hot) and camera == self.cameras[0]
         ):
             shutil.copyfile(
-                self._required("frames", camera, exposure, next(iter(factors))), target
+                self._required(camera, exposure, next(iter(factors))), target
             )
             return
         record = next(
@@ -165,9 +165,7 @@ class Laboratory:
         )
         base = value.copy()
         for light, factor in factors.items():
-            value += factor * (
-                _read(self._required("frames", camera, exposure, light)) - base
-            )
+            value += factor * (_read(self._required(camera, exposure, light)) - base)
         if camera == self.cameras[0]:
             value[self._hot[:, 0], self._hot[:, 1]] = white
         png = imagecodecs.png_encode(
@@ -191,10 +189,7 @@ class Laboratory:
             :LAMP_LIGHTS
         ]
         names = [str(self._record["lights"][i]["id"]) for i in nearest]
-        frames = {
-            name: _read(self._required("frames", camera, exposure, name))
-            for name in names
-        }
+        frames = {name: _read(self._required(camera, exposure, name)) for name in names}
         return max(
             names, key=lambda name: float(np.quantile(frames[name].mean(axis=-1), 0.9))
         )
@@ -212,10 +207,10 @@ class Laboratory:
         )
         return self.subject / name
 
-    def _required(self, key: str, camera: str, exposure: str, light: str) -> Path:
-        path = self._source(key, camera, exposure, light)
+    def _required(self, camera: str, exposure: str, light: str) -> Path:
+        path = self._source("frames", camera, exposure, light)
         if path is None:
-            raise KeyError(key)
+            raise KeyError("frames")
         return path
 
     def _probe_photograph(self, exposure: str) -> None:

@@ -21,27 +21,28 @@ BLOOD_SPREAD = 0.06  # log green, between people of equal melanin
 # The measured materials with the smallest Lambertian fraction (which a fit cannot
 # distinguish from R_d); two broad lobes, two sharp ones
 MATERIALS = ("special-walnut-224", "black-soft-plastic", "cherry-235", "black-phenolic")
+WAVES = 40  # of `smooth_noise`
 PATCH = 6.0  # mm about a probe site over which its colour is averaged
 
 
 def smooth_noise(
-    points: Float64, wavelength: float, *, rng: np.random.Generator, waves: int = 40
+    points: Float64, wavelength: float, *, rng: np.random.Generator
 ) -> Float64:
     """A Gaussian-like field (n,) of zero mean and unit variance over `points` (n, 3)
     mm: a sum of plane waves.
 
     Wavelengths vary by a factor of two around `wavelength` mm, directions are uniform.
     """
-    vector = rng.standard_normal((waves, 3))
-    number = 2 * np.pi / (wavelength * rng.uniform(0.7, 1.4, waves))
+    vector = rng.standard_normal((WAVES, 3))
+    number = 2 * np.pi / (wavelength * rng.uniform(0.7, 1.4, WAVES))
     vector *= (number / np.linalg.norm(vector, axis=1))[:, None]
-    phase = rng.uniform(0, 2 * np.pi, waves)
+    phase = rng.uniform(0, 2 * np.pi, WAVES)
     # float32 is sufficient, and 40 cosines per vertex dominate the cost of a skin
     wave = np.cos(
         points.astype(np.float32) @ vector.T.astype(np.float32)
         + phase.astype(np.float32)
     )
-    return np.asarray(wave.sum(axis=1, dtype=float) * np.sqrt(2 / waves))
+    return np.asarray(wave.sum(axis=1, dtype=float) * np.sqrt(2 / WAVES))
 
 
 @dataclass(frozen=True)

@@ -226,14 +226,14 @@ def takes_to_fit(
     return takes
 
 
-def takes_without_consent(db: Database, scope: str) -> list[str]:
-    """Takes with a capture whose subject does not agree to a scope; damaged ones are
+def takes_without_consent(db: Database) -> list[str]:
+    """Takes with a capture whose subject does not agree to fits; damaged ones are
     not looked at.
     """
     takes = []
     for take in db.takes("capture"):
         with suppress(InputError):
-            takes += [take] if scope not in db.consent(take) else []
+            takes += [take] if "fit" not in db.consent(take) else []
     return takes
 
 
