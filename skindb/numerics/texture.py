@@ -280,8 +280,9 @@ def level_fractions(mask: Image, shapes: Sequence[tuple[int, ...]]) -> list[Imag
         shape: _averages(mask.shape[1], shape[1])
         .dot(_averages(mask.shape[0], shape[0]).dot(mask).T)
         .T
-        for shape in {*shapes}
+        for shape in {*shapes} - {mask.shape}
     }
+    fractions[mask.shape] = mask
     return [fractions[shape] for shape in shapes]
 
 

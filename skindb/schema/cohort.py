@@ -384,20 +384,19 @@ class Stack:
     def __getitem__(self, key: tuple[Any, ...]) -> NDArray[Any]:
         first, *others = key
         takes = np.arange(len(self.sources))[first]
-        blank = selected(_absent(self.variable, self.size), others)
-        out = np.empty((takes.size, *np.shape(blank)), self.dtype)
-        out[:] = blank
+        blank = np.broadcast_to(_absent(self.variable, ()), self.size)
+        out = np.empty((takes.size, *selected(blank, others).shape), self.dtype)
         for i, take in enumerate(takes.flat):
             source = self.sources[take]
+            values = blank
             if source is not None:
                 values = self._in_layout(source.read(self.variable))
-                out[i] = selected(values, others)
+            out[i] = selected(values, others)
         return out if takes.ndim else out[0]
 
     def _in_layout(self, values: Values) -> NDArray[Any]:
         """Values of one take in the layout of the cohort."""
-        out = _absent(self.variable, self.size)
-        indices: list[Any] = []
+        indices: list[list[int]] = []
         extents = zip(
             VARIABLES[self.variable].dims, values.array.shape, self.size, strict=True
         )
@@ -406,8 +405,11 @@ class Stack:
                 place = self.places[dim]
                 indices.append([place[label] for label in values.labels[dim]])
             else:
-                indices.append(range(min(length, size)))
+                indices.append([*range(min(length, size))])
         inside = values.array[tuple(slice(len(index)) for index in indices)]
+        if indices == [[*range(size)] for size in self.size]:
+            return inside
+        out = _absent(self.variable, self.size)
         out[np.ix_(*indices)] = inside
         return out
 
