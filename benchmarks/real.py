@@ -38,7 +38,6 @@ from skindb.fit import (
     estimate_light_gains,
     estimate_normals,
     fit_surface,
-    reduce_basis,
     refine_jointly,
     refit,
 )
@@ -62,6 +61,7 @@ ISOTROPIC_95 = float(np.sqrt(-np.log(0.05)))
 # of a white facing surface times pi; smaller predictions tell nothing about gains
 MIN_PREDICTED = 0.01
 GAIN_ROUNDS = 3
+BASES = 4
 LIGHT_COUNTS = (4, 6, 8, 12, 24)
 PARTS = ("faces", "cat", "lights", "sphere", "brdfs")
 
@@ -116,11 +116,13 @@ def skindb_fit(photographs: Photographs, training: Mask, *, eta: float) -> Fitte
     samples = samples.assign(
         refine_jointly(samples, eta=eta, scan_error=NO_SCAN_DEGREES)
     )
-    surface = fit_surface(samples, surface=Mixture.of_dictionary(dictionary), eta=eta)
-    basis = reduce_basis(
-        surface.merge(samples), dictionary=dictionary, rng=np.random.default_rng(1)
+    mixture_model = Mixture.of_dictionary(dictionary)
+    surface = fit_surface(samples, surface=mixture_model, eta=eta)
+    basis = mixture_model.reduced(
+        surface.merge(samples), k=BASES, rng=np.random.default_rng(1)
     )
-    weight = refit(samples, basis=basis, eta=eta)["basis_weight"].values
+    # pixels with few samples have no gloss
+    weight = np.nan_to_num(refit(samples, basis=basis, eta=eta)["basis_weight"].values)
     normal = samples["shading_normal"].values.astype(np.float64)
     diffuse = samples["diffuse_reflectance"].values.mean(axis=1)
     predicted = _predicted(
@@ -139,7 +141,7 @@ def _predicted(
     eta: float,
 ) -> Array:
     """Samples (n, light) of the model; NaN for pixels without a normal."""
-    unknown = ~np.isfinite(normal).all(axis=1)
+    unknown = ~np.isfinite(normal).all(axis=1) | ~np.isfinite(diffuse)
     normal = np.where(unknown[:, None], [0.0, 0.0, 1.0], normal)
     view = np.array([0.0, 0.0, 1.0])
     seen = np.clip(normal @ view, 1e-3, 1)

@@ -173,14 +173,17 @@ def region_tables(fitted: xr.Dataset, masks: Mapping[str, Mask]) -> xr.Dataset:
 
 
 def trusted_surfels(fitted: xr.Dataset) -> Mask:
-    """Mask (surfel,) of surfels that are fitted, well-conditioned and have enough
-    samples; see `TexelStatus`.
+    """Mask (surfel,) of surfels that are fitted, by Lambert's law at least,
+    well-conditioned and have enough samples; see `TexelStatus`. In takes without a surfel
+    that has enough, as under few lights, the number of samples does not matter.
     """
-    good = fitted[variables.FIT_STATUS].values == FitStatus.FITTED
+    status = fitted[variables.FIT_STATUS].values
+    good = np.isin(status, (FitStatus.FITTED, FitStatus.LAMBERT))
     if variables.FIT_CONDITION in fitted:
         good &= ~(fitted[variables.FIT_CONDITION].values > MAX_CONDITION_TRUSTED)
     if variables.FIT_SAMPLES in fitted:
-        good &= fitted[variables.FIT_SAMPLES].values >= MIN_SAMPLES_TRUSTED
+        enough = fitted[variables.FIT_SAMPLES].values >= MIN_SAMPLES_TRUSTED
+        good &= enough | ~(good & enough).any()
     return np.asarray(
         good & np.isfinite(fitted[variables.DIFFUSE_REFLECTANCE].values).all(axis=1)
     )

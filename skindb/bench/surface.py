@@ -14,10 +14,11 @@ from sklearn.decomposition import NMF
 from sklearn.exceptions import ConvergenceWarning
 
 from skindb.bench.curve import Curve, Point, cpu_time
-from skindb.fit.surface import MIN_SAMPLES, NOISE_FLOOR_SURFACE
+from skindb.fit.surface import NOISE_FLOOR_SURFACE
 from skindb.numerics.factorise import nmf, relative_error
 from skindb.optics.angles import half_difference
 from skindb.optics.fresnel import fresnel_transmittance
+from skindb.reflectance._lumitexel_kernels import MIN_SAMPLES_GLOSS
 from skindb.reflectance.dictionary import (
     Dictionary,
     convolve_disc,
@@ -198,7 +199,7 @@ def _errors(samples: Strip, count: int, predict: Predict) -> tuple[float, ...]:
 
 def _fit(samples: Strip, model: Mixture, mode: str) -> tuple[float, SurfaceFit]:
     """CPU time per surfel [s], and weights of all surfels."""
-    comparison = Comparison(mode, ETA, NOISE_FLOOR_SURFACE, MIN_SAMPLES)
+    comparison = Comparison(mode, ETA, NOISE_FLOOR_SURFACE, MIN_SAMPLES_GLOSS)
     model.fit(samples.start(2), comparison)  # compiles
     surfels = len(samples.offsets) - 1
     return cpu_time(partial(model.fit, samples.block, comparison), surfels)
@@ -279,7 +280,7 @@ def refit_curves(quick: bool) -> list[Curve]:
         seconds, fit = _fit(samples, four, mode)
         measured.append((f"skindb {mode}", seconds, fit.parameters))
     surfels = len(samples.offsets) - 1
-    comparison = Comparison("linear", ETA, NOISE_FLOOR_SURFACE, MIN_SAMPLES)
+    comparison = Comparison("linear", ETA, NOISE_FLOOR_SURFACE, MIN_SAMPLES_GLOSS)
     errors = Judgement(np.full((surfels, 3), 0.01), np.full(surfels, 0.5))
     judge = partial(four.judge, samples.block, comparison, errors)
     judge()  # compiles

@@ -26,6 +26,9 @@ COMBINED, CHROMATIC, PHOTOMETRIC = range(3)
 # degrees
 NOISE_FACTOR_NORMAL = 3.0
 MODEL_ERROR_DEGREES = 1.0
+# Larger ones say that the lights do not determine the normal: lights in a plane and no
+# scan give 42.
+MAX_ERROR_DEGREES = 30.0
 
 
 @kernel
@@ -173,5 +176,8 @@ def normals_block(
         total[s] = math.nan
         if np.isfinite(chosen[s]).all():
             error[s] = math.degrees(math.sqrt(_variance(share, estimates, scan_error)))
-            if method == COMBINED:
+            if error[s] > MAX_ERROR_DEGREES:
+                chosen[s] = math.nan
+                error[s] = math.nan
+            elif method == COMBINED:
                 total[s] = _total_error(error[s], estimates)

@@ -57,9 +57,9 @@ def estimate_diffuse_reflectance(
     -------
     Dataset
         `diffuse_reflectance` within [1e-4, 0.9999], `diffuse_reflectance_error`,
-        `diffuse_reflectance_total_error`, `dipole_s`; NaN where fewer than ten samples
-        lie above the grazing limit. R_d includes what the surface reflects evenly and
-        without colour, see `skindb.fit.energy`. The error
+        `diffuse_reflectance_total_error`, `dipole_s`; NaN with fewer than three samples.
+        Below four above the grazing limit others are used as well. R_d includes what the
+        surface reflects evenly and without colour, see `skindb.fit.energy`. The error
         is that of the samples' noise and, at first order, of the normal: 93
         to 97 % of the true values lie within 1.96 of it where the model holds, with
         given and with estimated normals. It ignores that both use the same samples: an

@@ -129,14 +129,13 @@ def without_even_reflection(
     area = fitted[variables.SURFEL_AREA].values[good]
     diffuse = fitted[variables.DIFFUSE_REFLECTANCE].values
     eta = float(fitted[variables.REFRACTIVE_INDEX])
-    seen = float(
-        np.average(fitted[variables.SURFACE_REFLECTANCE].values[good], weights=area)
-    )
+    surface = fitted[variables.SURFACE_REFLECTANCE].values[good]
+    seen = float(np.average(surface, weights=area)) if good.any() else np.nan
     summary: dict[str, Any] = {"highlights": seen}
     even, error = 0.0, UNKNOWN_ERROR
     if leak is not None:
         error *= leak
-    elif prior is not None:
+    elif prior is not None and good.any():
         contradicted = seen > prior.mean + MAX_DEVIATIONS * prior.error
         summary |= prior._asdict() | {"contradicted": contradicted}
         if not contradicted:

@@ -24,6 +24,7 @@ from skindb.fit.lumitexels import (
     take_noise,
 )
 from skindb.fit.quality import HELD_OUT_ERRORS, misfits
+from skindb.reflectance._lumitexel_kernels import MIN_SAMPLES_GLOSS
 from skindb.reflectance.kinds import surface_model
 from skindb.reflectance.model import (
     MIN_LOBE_WIDTH,
@@ -38,7 +39,6 @@ from skindb.types import Array
 NEEDED = (*GEOMETRY, "shading_normal", "diffuse_reflectance")
 # sr^-1; noise of a sample of dark skin by photons and resampling; that of the sensor may be larger
 NOISE_FLOOR_SURFACE = 2e-3
-MIN_SAMPLES = 10
 ERROR_INPUTS = ("diffuse_reflectance_error", "normal_error")
 SURFELS_PER_BLOCK = 4096  # surfels per task if the samples are not lazy
 
@@ -81,7 +81,9 @@ def fit_surface(
         `fit_status`; NaN where the status says that nothing was fitted.
     """
     check(lumitexels, NEEDED, where="lumitexels")
-    comparison = Comparison(mode, eta, noise_floor(lumitexels), MIN_SAMPLES, min_width)
+    comparison = Comparison(
+        mode, eta, noise_floor(lumitexels), MIN_SAMPLES_GLOSS, min_width
+    )
     noise = take_noise(lumitexels)
     names = _unique(*NEEDED, *noise_inputs(lumitexels))
 
@@ -281,7 +283,7 @@ def _judged(
     *,
     mode: str,
     eta: float,
-    min_samples: int = MIN_SAMPLES,
+    min_samples: int = MIN_SAMPLES_GLOSS,
     min_width: float = MIN_LOBE_WIDTH,
     evaluate: bool = False,
     held: NDArray[np.int64] | None = None,

@@ -62,7 +62,7 @@ Point = Float64  # (3,) mm
 FORMAT = "skindb-capture"
 VERSIONS = (1, 2)
 OVERRIDE = ("screened", "consented", "eyes_closed")  # what the operator confirms
-# degrees; larger ones than the maximum cannot be distinguished
+# degrees
 MIN_SCAN_ERROR = 0.1
 MAX_SCAN_ERROR = 90.0
 SCOPES = ("fit", "statistics", "export", "publish")

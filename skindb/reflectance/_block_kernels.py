@@ -14,8 +14,8 @@ import numpy as np
 
 from skindb.jit import kernel
 from skindb.reflectance._lumitexel_kernels import (
-    FEW,
     FITTED,
+    LAMBERT,
     OUTLIER_SPREAD,
     PERCEPTUAL,
     JudgedErrors,
@@ -105,10 +105,13 @@ def fit_block(block: Block, tables: Tables, options: Options, out: SurfaceFit) -
         out.samples[s] = count
         seen = smallest_half_angle(count, b)
         out.half_angle[s] = math.degrees(seen)
-        if count < options.min_samples:
-            out.status[s] = FEW
-            continue
         split_diffuse(block.diffuse[s], count, b)
+        if count < options.min_samples:
+            matt = fitted_status(True, block.diffuse[s])
+            out.status[s] = LAMBERT if matt == FITTED else matt
+            b.surface[:] = 0.0
+            out.residual[s], out.residual_perceptual[s] = add_surface(count, b)
+            continue
         weigh(s, count, block.noise, options, b)
         x = out.parameters[s]
         if options.solve:
@@ -199,17 +202,15 @@ def judge_block(
         if prepare(s, block, options, b) != FITTED:
             x[:] = np.nan
             continue
-        if not options.solve and not np.isfinite(x).all():
-            continue
         choose_kind(0, errors.held, b)
         count = write_rows(block.normal[s], table, b)
-        if count < options.min_samples:
-            if options.solve:
-                x[:] = np.nan
-            continue
+        matt = count < options.min_samples
+        matt = matt if options.solve else not np.isfinite(x).all()
         split_diffuse(block.diffuse[s], count, b)
         weigh(s, count, block.noise, options, b)
-        if options.solve:
+        if matt:
+            x[:] = 0.0
+        elif options.solve:
             seen = smallest_half_angle(count, b)
             _block_narrow(tables.half_width, options.min_width * seen, work)
             _fit_rows(count, lift, options, x, b, work)
@@ -220,7 +221,7 @@ def judge_block(
         predict(b.rows, count, x, b.surface, work.single)
         if out.counts.shape[2] > 0:
             out.outlier[s] = outliers(count, options, b, work.root, out.counts)
-        if out.covariance.shape[1] > 0:
+        if out.covariance.shape[1] > 0 and not matt:
             _write_covariance(s, count, block, options, errors, out, b, work)
             if errors.turn[s] > 0.0:
                 add_turned(
@@ -240,3 +241,5 @@ def judge_block(
         for kind in range(1, 3):
             if kinds[kind]:
                 _write_held_error(s, kind, block, tables, errors, out, b, work)
+        if matt:
+            x[:] = np.nan

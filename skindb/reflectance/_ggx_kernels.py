@@ -15,8 +15,8 @@ import numpy as np
 
 from skindb.jit import fast_kernel, inline_fast_kernel, kernel
 from skindb.reflectance._lumitexel_kernels import (
-    FEW,
     FITTED,
+    LAMBERT,
     MIN_COSINE_SURFACE,
     PERCEPTUAL,
     JudgedErrors,
@@ -304,10 +304,15 @@ def fit_ggx(block: Block, index: float, options: Options, out: SurfaceFit) -> No
         count = write_samples(b)
         out.samples[s] = count
         out.half_angle[s] = math.degrees(smallest_half_angle(count, b))
-        if count < options.min_samples:
-            out.status[s] = FEW
-            continue
         write_lobe(block.diffuse[s], count, index, b, lobe)
+        if count < options.min_samples:
+            matt = fitted_status(True, block.diffuse[s])
+            out.status[s] = LAMBERT if matt == FITTED else matt
+            none = np.array([0.0, 1.0])
+            out.residual[s], out.residual_perceptual[s] = _lobe_errors(
+                count, none, b, lobe
+            )
+            continue
         weigh(s, count, block.noise, options, b)
         x = out.parameters[s]
         out.iterations[s], converged = _solve(count, options, x, b, lobe)
@@ -398,17 +403,16 @@ def judge_ggx(
         if prepare(s, block, options, b) != FITTED:
             x[:] = np.nan
             continue
-        if not options.solve and not np.isfinite(x).all():
-            continue
         choose_kind(0, errors.held, b)
         count = write_samples(b)
-        if count < options.min_samples:
-            if options.solve:
-                x[:] = np.nan
-            continue
+        matt = count < options.min_samples
+        matt = matt if options.solve else not np.isfinite(x).all()
+        if matt:
+            x[STRENGTH] = 0.0
+            x[ROUGHNESS] = 1.0
         write_lobe(d, count, index, b, lobe)
         weigh(s, count, block.noise, options, b)
-        if options.solve:
+        if options.solve and not matt:
             _solve(count, options, x, b, lobe)
         else:
             _write_values(count, x[ROUGHNESS], lobe)
@@ -430,6 +434,8 @@ def judge_ggx(
             write_lobe(d, count, index, b, lobe)
             error = _lobe_errors(count, x, b, lobe)
             out.held_error[s, kind - 1, 0], out.held_error[s, kind - 1, 1] = error
+        if matt:
+            x[:] = np.nan
 
 
 @kernel

@@ -23,6 +23,10 @@ from skindb.numerics._nnls_kernels import (
 from skindb.reflectance._lumitexel_kernels import (
     FITTED,
     MIN_COSINE_SURFACE,
+    MIN_SAMPLES_GLOSS,
+    MIN_SAMPLES_LAMBERT,
+    MIN_SAMPLES_LOBES,
+    MODEL_ERROR,
     OUTLIER_SPREAD,
     Lumitexel,
     Options,
@@ -58,28 +62,29 @@ SAMPLE = LOBE + LOBES
 WIDTH = SAMPLE + 3
 PARAMETERS = 3 + LOBES  # R_d and the strengths of the lobes
 UNKNOWNS = PARAMETERS + 2  # and two angles of the normal
-# Gauss-Newton steps in the normal: a second one changed normals by 0.002 degrees and
-# predictions of photographed faces by 0.02 % (three faces, one capture)
-STEPS = 1
-# of the step, because errors of the given normal are partly independent of those of the
-# joint fit: on six captures with known truth, medians are 0.5 to 0.8 degrees (imperfect
-# capture 1.7), best or within 0.07 of the better one of both
-STEP_FRACTION = 0.7
+FEW_UNKNOWNS = 6  # R_d, the factor of the shared lobe and the normal
+# Standard deviation of the factor of the shared lobe, a prior. Without it, the lobe
+# explains all light of one in eight pixels of a face under six lights; with 3, predictions
+# of the cat of DiLiGenT under eight lights are worse by a sixth.
+GLOSS_SPREAD = 8.0
 MAX_STEP = 0.15  # rad
 DIFFERENCE = 1e-3  # rad, for derivatives by the normal
 KKT_TOLERANCE = 1e-8
 # half width at half maximum of a lobe, as an angle of the half vector, over its roughness
 HALF_WIDTH = math.sqrt(math.sqrt(2.0) - 1.0)
-ONE, HALF_PER_PI = (np.float32(c) for c in (1.0, 0.5 / math.pi))
+ZERO, ONE, HALF_PER_PI = (np.float32(c) for c in (0.0, 1.0, 0.5 / math.pi))
 
 
 class Lobes(NamedTuple):
     """The lobes, from wide to narrow, and the scan's normals."""
 
     square: Vector32  # (LOBES,) squared roughness
+    shared: Vector32  # (LOBES,) strengths of the one lobe of surfels with few samples
     refractive_index: float  # of their Fresnel factor
     scan: Matrix  # (n, 3) unit normals of the scan
     scan_error: float  # rad, standard error of these about each axis
+    steps: int  # of the normal
+    step_fraction: float  # of a Gauss-Newton step
 
 
 class JointFit(NamedTuple):
@@ -93,6 +98,7 @@ class JointFit(NamedTuple):
     diffuse_shared: Matrix  # (n, 3)
     strength: Matrix  # (n, LOBES)
     kkt: Vector  # (n,) of the last non-negative problem
+    samples: IntVector  # (n,)
 
 
 class JointMemory(NamedTuple):
@@ -110,7 +116,9 @@ class JointMemory(NamedTuple):
     rest: Vector  # (WIDTH,)
     block: Matrix32  # (LANES + 1, LANES) sums in vector registers
     active_set: ActiveSetMemory
-    x: Vector  # (PARAMETERS,) R_d and strengths
+    # (PARAMETERS,) R_d and strengths; for few samples one factor of the shared lobe
+    x: Vector
+    strength: Vector  # (LOBES,) of the lobes
     target: Vector  # (PARAMETERS,) right side
     gram: Matrix  # (PARAMETERS, PARAMETERS)
     cross: Matrix  # (PARAMETERS, 2) of the parameters and the normal
@@ -150,6 +158,7 @@ def joint_memory(lights: int, cameras: int) -> JointMemory:
         np.empty((LANES + 1, LANES), np.float32),
         active_set_memory(PARAMETERS),
         np.empty(PARAMETERS),
+        np.zeros(LOBES),
         np.empty(PARAMETERS),
         np.empty((PARAMETERS, PARAMETERS)),
         np.empty((PARAMETERS, 2)),
@@ -243,7 +252,8 @@ def _write_turned(
             q = half * (square[j] - ONE) + ONE
             shadow = camera * m.lit[i, j] + light * m.seen[o, j]
             lobe = strength * square[j] / (q * q * shadow)
-            change += np.float32(m.x[3 + j]) * (lobe - m.table[r, LOBE + j])
+            change += np.float32(m.strength[j]) * lobe
+            change -= np.float32(m.x[3 + j]) * m.table[r, LOBE + j]
         m.table[r, TURNED + k] = (shape - m.table[r, DIFFUSE]) * per_angle
         m.table[r, SURFACE + k] = change * per_angle
 
@@ -310,9 +320,22 @@ def _write_weights(
 
 
 @kernel
-def _write_equations(lobes: int, m: JointMemory) -> None:
+def _least_variance(count: int, b: Lumitexel, m: JointMemory) -> float:
+    """Weighted mean square of the error of models, which few samples do not show; 0 for
+    others.
+    """
+    if count >= MIN_SAMPLES_LOBES:
+        return 0.0
+    total = 0.0
+    for r in range(count):
+        total += m.weight[r] * b.surface[r] ** 2
+    return 3.0 * MODEL_ERROR**2 * total / count
+
+
+@kernel
+def _write_equations(count: int, lobes: int, b: Lumitexel, m: JointMemory) -> None:
     """Write the normal equations of R_d, of the first lobes and of the normal, from the
-    Gram matrix of the table.
+    Gram matrix of the table, with the prior of the shared lobe.
     """
     M = m.moments
     total = m.x[0] + m.x[1] + m.x[2]
@@ -342,10 +365,11 @@ def _write_equations(lobes: int, m: JointMemory) -> None:
             mixed = M[TURNED + k, SURFACE + q] + M[SURFACE + k, TURNED + q]
             m.turn[k, q] = squares * M[TURNED + k, TURNED + q] + total * mixed
             m.turn[k, q] += 3.0 * M[SURFACE + k, SURFACE + q]
+    m.gram[3, 3] += _least_variance(count, b, m) / GLOSS_SPREAD**2
 
 
 @kernel
-def _variance(count: int, m: JointMemory) -> float:
+def _variance(count: int, b: Lumitexel, m: JointMemory) -> float:
     """Weighted mean square of the residuals at `m.x`."""
     M = m.moments
     total = 0.0
@@ -358,7 +382,10 @@ def _variance(count: int, m: JointMemory) -> float:
             total += 2.0 * x * (d * M[DIFFUSE, LOBE + i] - M[LOBE + i, SAMPLE + c])
             for j in range(LOBES):
                 total += x * m.x[3 + j] * M[LOBE + i, LOBE + j]
-    return max(total, 0.0) / max(3.0 * count - UNKNOWNS, 1.0)
+    unknowns = UNKNOWNS if count >= MIN_SAMPLES_LOBES else FEW_UNKNOWNS
+    return max(
+        total / max(3.0 * count - unknowns, 1.0), _least_variance(count, b, m), 0.0
+    )
 
 
 @kernel
@@ -397,13 +424,30 @@ def _eliminate_normal(m: JointMemory) -> bool:
 
 
 @kernel
-def _solve_parameters(m: JointMemory) -> float:
-    """Write `m.x`; returns the KKT residual."""
+def _solve_parameters(count: int, lobes: Lobes, m: JointMemory) -> float:
+    """Write `m.x` and `m.strength`; returns the KKT residual."""
     limit = 6 * PARAMETERS
     kkt, _, _, _ = solve_scaled(
         m.gram, m.target, m.x, KKT_TOLERANCE, limit, m.active_set
     )
+    for j in range(LOBES):
+        together = m.x[3] * lobes.shared[j]
+        m.strength[j] = together if count < MIN_SAMPLES_LOBES else m.x[3 + j]
     return kkt
+
+
+@kernel
+def _write_lobes(count: int, lobes: Lobes, b: Lumitexel, m: JointMemory) -> None:
+    """Write the columns of the diffuse shape and of the lobes, or of the shared one."""
+    _write_columns(count, lobes.square, b, m)
+    if count >= MIN_SAMPLES_LOBES:
+        return
+    for r in range(count):
+        shared = ZERO
+        for j in range(LOBES):
+            shared += lobes.shared[j] * m.table[r, LOBE + j]
+            m.table[r, LOBE + j] = ZERO
+        m.table[r, LOBE] = shared
 
 
 @kernel
@@ -411,10 +455,10 @@ def _turn_normal(
     s: int, count: int, lobes: Lobes, eta: float, b: Lumitexel, m: JointMemory
 ) -> None:
     """A Gauss-Newton step of the normal together with the other parameters."""
-    _add_scan(s, _variance(count, m), lobes, m)
+    _add_scan(s, _variance(count, b, m), lobes, m)
     if not _eliminate_normal(m):
         return
-    _solve_parameters(m)
+    _solve_parameters(count, lobes, m)
     for k in range(2):
         m.step[k] = 0.0
         for q in range(2):
@@ -423,12 +467,12 @@ def _turn_normal(
                 rest -= m.cross[i, q] * m.x[i]
             m.step[k] += m.turn[k, q] * rest
     size = math.sqrt(m.step[0] ** 2 + m.step[1] ** 2)
-    shrink = min(STEP_FRACTION, MAX_STEP / max(size, 1e-12))
+    shrink = min(lobes.step_fraction, MAX_STEP / max(size, 1e-12))
     _turn(shrink * m.step[0], shrink * m.step[1], m)
     for k in range(3):
         m.normal[k] = m.turned[k]
     _face(m.normal, eta, lobes.square, b, m)
-    _write_columns(count, lobes.square, b, m)
+    _write_lobes(count, lobes, b, m)
 
 
 @kernel
@@ -538,10 +582,12 @@ def _write_errors(
     _add_products(m.by_light, size, m.shared)
     _add_products(m.by_camera, size, m.shared)
     few = OUTLIER_SPREAD * count / max(count - size, 1.0)
+    least = _least_variance(count, b, m)
     normal = 0.0
     normal_shared = 0.0
     for p in range(size):
         alone = few * _variance_of(p, size, m.independent, m.inverse)
+        alone = max(alone, least * m.inverse[p, p])
         together = max(
             OUTLIER_SPREAD * _variance_of(p, size, m.shared, m.inverse), alone
         )
@@ -583,7 +629,7 @@ def _start(
             m.table[r, SAMPLE + c] = b.sample[c, r]
     _write_angles(count, lobes.refractive_index, b, m)
     _face(m.normal, eta, lobes.square, b, m)
-    _write_columns(count, lobes.square, b, m)
+    _write_lobes(count, lobes, b, m)
 
 
 @kernel
@@ -600,36 +646,40 @@ def _fit(
     """Fit the chosen samples of surfel s."""
     _start(s, count, block, lobes, o.eta, b, m)
     narrowest = o.min_width * smallest_half_angle(count, b)
-    wide = 1
-    while wide < LOBES and HALF_WIDTH * math.sqrt(lobes.square[wide]) >= narrowest:
+    limit = LOBES if count >= MIN_SAMPLES_LOBES else 1
+    wide = 1 if count >= MIN_SAMPLES_GLOSS else 0
+    while 0 < wide < limit:
+        if HALF_WIDTH * math.sqrt(lobes.square[wide]) < narrowest:
+            break
         wide += 1
     _write_weights(s, count, block, o, b, m)
     _sum_table(count, m)
-    _write_equations(wide, m)
-    _solve_parameters(m)
-    for _ in range(STEPS):
+    _write_equations(count, wide, b, m)
+    _solve_parameters(count, lobes, m)
+    for _ in range(lobes.steps):
         _write_weights(s, count, block, o, b, m)
         _write_derivatives(count, o.eta, lobes.square, b, m)
         _sum_table(count, m)
-        _write_equations(wide, m)
+        _write_equations(count, wide, b, m)
         _turn_normal(s, count, lobes, o.eta, b, m)
     _write_weights(s, count, block, o, b, m)
     _sum_table(count, m)
-    _write_equations(wide, m)
-    out.kkt[s] = _solve_parameters(m)
-    _write_equations(wide, m)
-    _add_scan(s, _variance(count, m), lobes, m)
+    _write_equations(count, wide, b, m)
+    out.samples[s] = count
+    out.kkt[s] = _solve_parameters(count, lobes, m)
+    _write_equations(count, wide, b, m)
+    _add_scan(s, _variance(count, b, m), lobes, m)
     _write_errors(s, count, b, m, out)
     for k in range(3):
         out.normal[s, k] = m.normal[k]
         out.diffuse[s, k] = m.x[k]
     for j in range(LOBES):
-        out.strength[s, j] = m.x[3 + j]
+        out.strength[s, j] = m.strength[j]
 
 
 @kernel
 def fit_jointly(block: Block, lobes: Lobes, o: Options, out: JointFit) -> None:
-    """Fit every surfel of a block that has a normal, R_d and enough samples."""
+    """Fit every surfel of a block that has a normal, R_d and three samples."""
     b = block_memory(block, 0)
     m = joint_memory(block.light.shape[0], block.camera.shape[0])
     for s in range(block.position.shape[0]):
@@ -643,6 +693,6 @@ def fit_jointly(block: Block, lobes: Lobes, o: Options, out: JointFit) -> None:
         write_directions(block.position[s], block.light, block.camera, b)
         write_gloss(block.polarisation, o.eta, b)
         write_cosines(n, o.eta, MIN_COSINE_SURFACE, b)
-        if choose(b) < o.min_samples:
+        if choose(b) < MIN_SAMPLES_LAMBERT:
             continue
         _fit(s, write_samples(b), block, lobes, o, b, m, out)

@@ -31,6 +31,9 @@ from skindb.numerics._nnls_kernels import (
     solve_scaled,
 )
 from skindb.reflectance._lumitexel_kernels import (
+    MIN_COSINE_SURFACE,
+    MIN_SAMPLES_GLOSS,
+    MIN_SAMPLES_LAMBERT,
     MODEL_ERROR,
     UNSEEN,
     Lumitexel,
@@ -58,7 +61,7 @@ from skindb.types import (
 
 # to light or camera; below it F_t and the footprint of a pixel change too fast
 MIN_COSINE_ALBEDO = 0.25
-# of a surfel, above the minimum cosine; fewer cannot separate eight columns
+# of crossed samples, to be used alone
 MIN_SAMPLES_ALBEDO = 10
 # of crossed polarisers, relative to depolarised light: theta_d up to 39 degrees
 MAX_GLOSS_CROSSED = 0.3
@@ -567,14 +570,18 @@ def separate(
     error[:] = np.nan
     total[:] = np.nan
     write_cosines(n, eta, MIN_COSINE_ALBEDO, b)
-    if choose(b) < MIN_SAMPLES_ALBEDO:
-        return 1.0
+    if choose(b) < MIN_SAMPLES_GLOSS:  # grazing samples are better than none
+        write_cosines(n, eta, MIN_COSINE_SURFACE, b)
+        if choose(b) < MIN_SAMPLES_LAMBERT:
+            return 1.0
     _choose_crossed(b)
     count = write_rows(n, table, b)
     write_noise(surfel, count, noise, b)
     for r in range(count):
         s.shape[r] = b.enters[b.pairs[r, 0]] * b.leaves[b.pairs[r, 1]]
         s.mean[r] = (b.sample[0, r] + b.sample[1, r] + b.sample[2, r]) / np.float32(3)
+        if count < MIN_SAMPLES_GLOSS:
+            b.rows[r, :] = 0.0
         b.rows[r, SHAPE] = s.shape[r]
     tint, variance, shared = _separate_channels(count, b, s, estimate)
     if turn[1] > 0.0:

@@ -54,7 +54,7 @@ from skindb.reflectance.sampling import (
     half_vectors,
 )
 from skindb.reflectance.tables import Table, tabulate
-from skindb.schema import check, dataset, variables
+from skindb.schema import FitStatus, check, dataset, variables
 from skindb.schema.notes import Omission
 from skindb.types import Array
 
@@ -165,7 +165,8 @@ class GGX:
         rng: np.random.Generator,  # noqa: ARG002
     ) -> xr.Dataset:
         """The refractive index; lobes have no components."""
-        fitted_surfels(fitted, self.PARAMETERS)
+        if not (fitted[variables.FIT_STATUS] == FitStatus.LAMBERT).any():
+            fitted_surfels(fitted, self.PARAMETERS)
         shared = {
             variables.LOBE_INDEX: self.index,
             variables.DISC_ANGULAR_RADIUS: self.disc_angular_radius,

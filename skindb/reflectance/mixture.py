@@ -48,7 +48,7 @@ from skindb.reflectance.tables import (
     kernel_tables,
     pad_to_lanes,
 )
-from skindb.schema import FitStatus, check, variables
+from skindb.schema import FitStatus, check, dataset, variables
 from skindb.schema.notes import Omission
 from skindb.types import Array, Float64
 
@@ -237,11 +237,26 @@ class Mixture:
     def reduced(
         self, fitted: xr.Dataset, *, k: int, rng: np.random.Generator
     ) -> xr.Dataset:
-        """Basis of k mixtures of the dictionary, or fewer for few fitted surfels."""
+        """Basis of k mixtures of the dictionary, or fewer for few fitted surfels; without
+        gloss at any surfel the mean of the dictionary, whose mean weights are NaN.
+        """
         assert self.dictionary is not None
-        good = int((fitted["fit_status"] == FitStatus.FITTED).sum())
+        status = fitted[variables.FIT_STATUS].values
+        good = int((status == FitStatus.FITTED).sum())
+        if not good and (status == FitStatus.LAMBERT).any():
+            count = len(self.names)
+            fitted = dataset(
+                {
+                    variables.DICTIONARY_WEIGHT: np.full((1, count), 1 / count),
+                    variables.FIT_STATUS: [FitStatus.FITTED],
+                    variables.SURFEL_AREA: [1.0],
+                }
+            )
         k = max(1, min(k, good))
-        return reduce_basis(fitted, dictionary=self.dictionary, k=k, rng=rng)
+        basis = reduce_basis(fitted, dictionary=self.dictionary, k=k, rng=rng)
+        if not good:
+            basis[variables.MEAN_DICTIONARY_WEIGHT][:] = np.nan
+        return basis
 
     def judge(
         self,

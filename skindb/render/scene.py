@@ -196,6 +196,8 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
     values = {name: np.asarray(fitted[name].values) for name in NEEDED}
     values[variables.DIFFUSE_REFLECTANCE] = even_diffuse(fitted)
     values["parameters"] = reflectance.parameters_of(fitted)
+    matt = values[variables.FIT_STATUS] == FitStatus.LAMBERT
+    values["parameters"] = np.where(matt[:, None], 0.0, values["parameters"])
     if variables.SIGMA_TR in fitted:
         values[variables.SIGMA_TR] = np.asarray(fitted[variables.SIGMA_TR].values)
     position = values.pop(variables.SURFEL_POSITION)
@@ -243,6 +245,7 @@ def usable_surfels(values: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
             FitStatus.DIFFUSE_CLAMPED,
             FitStatus.NOT_CONVERGED,
             FitStatus.OBSTRUCTED,
+            FitStatus.LAMBERT,
         ],
     )
     for name in (variables.SHADING_NORMAL, variables.DIFFUSE_REFLECTANCE, "parameters"):

@@ -60,6 +60,14 @@ class FitStatus(Explained):
         7,
         "darker than the face and unlike any surface: hair in front of the skin, or a deep fold",
     )
+    LAMBERT = (
+        8,
+        "three samples: normal and diffuse reflectance by Lambert's law, no gloss",
+    )
+    UNDETERMINED = (
+        9,
+        "the lights of the samples do not determine the normal; nothing was fitted",
+    )
 
 
 class ProbeStatus(Explained):

@@ -156,7 +156,8 @@ FIT_RESIDUAL_PERCEPTUAL = declare(
 )
 FIT_SAMPLES = declare(
     "int32 fitted/fit_samples(surfel) [1]",
-    "samples used by the fit of the dictionary",
+    "samples used by the fit of the surface; normal and R_d are fitted with one lobe for "
+    "4 to 11, and with lobes of eight widths for 12 or more",
 )
 SMALLEST_HALF_ANGLE = declare(
     "float32 fitted/smallest_half_angle(surfel) [degree]",

@@ -81,7 +81,7 @@ def dome():
     return light, camera
 
 
-def _refined(sample, normal, dome, diffuse=R_D, noise=None):
+def _refined(sample, normal, dome, diffuse=R_D, noise=None, scan_error=1.0):
     n = len(normal)
     light, camera = (FAR_MM * w for w in dome)
     block = Block(
@@ -94,7 +94,7 @@ def _refined(sample, normal, dome, diffuse=R_D, noise=None):
         noise or typical_noise(),
     )
     scan = np.tile([0.0, 0.0, 1.0], (n, 1))
-    return refine_block(block, COMPARISON, scan_normal=scan, scan_error=1.0)
+    return refine_block(block, COMPARISON, scan_normal=scan, scan_error=scan_error)
 
 
 def _angle(a, b):
@@ -114,13 +114,16 @@ def test_refine_block__returns_planted_parameters(dome):
     assert (refined.kkt < 1e-6).all()
 
 
-def test_refine_block__turns_the_normal_by_seven_tenths_of_the_way(dome):
+def test_refine_block__turns_the_normal_by_seven_tenths_of_the_way_beside_a_scan(dome):
     rng = np.random.default_rng(2)
     normal = _normals(20, 0.1, rng)
     start = _unit(normal + np.radians(1.5) * rng.normal(size=normal.shape) / 1.4)
-    refined = _refined(_samples(normal, *dome), start, dome)
-    ratio = _angle(refined.normal, normal) / _angle(start, normal)
-    assert 0.2 < np.median(ratio) < 0.4  # curvature of the peak adds to 0.3
+    # of a scan, whose prior has no weight beside exact samples; curvature of the peak adds
+    # to 0.3
+    for scan_error, low, high in ((0.1, 0.2, 0.4), (1.0, 0.0, 0.01)):
+        refined = _refined(_samples(normal, *dome), start, dome, scan_error=scan_error)
+        ratio = _angle(refined.normal, normal) / _angle(start, normal)
+        assert low < np.median(ratio) < high
 
 
 def test_refine_block__is_robust_against_shadows(dome):
@@ -162,9 +165,8 @@ def test_refine_block__states_the_errors_of_noise(dome):
     # make it smaller
     assert 0.75 < z.std() < 1.15
     assert (refined.diffuse_shared >= refined.diffuse_error).all()
-    # the step is damped: the noise of the normal is 0.7 of the stated one
     angle = np.radians(_angle(refined.normal, normal))
-    assert 0.5 < np.sqrt((angle**2).mean()) / np.median(refined.normal_error) < 0.9
+    assert 0.8 < np.sqrt((angle**2).mean()) / np.median(refined.normal_error) < 1.2
 
 
 def test_refine_jointly__keeps_estimates_of_surfels_with_few_samples():
@@ -172,7 +174,7 @@ def test_refine_jointly__keeps_estimates_of_surfels_with_few_samples():
     samples = skin.lumitexels
     samples = samples.merge(estimate_normals(samples, eta=ETA))
     samples = samples.merge(estimate_diffuse_reflectance(samples, eta=ETA))
-    few = samples.isel(light=slice(0, 1))
+    few = samples.isel(light=slice(0, 1), camera=slice(0, 2))
     refined = refine_jointly(few, eta=ETA)
     for name in refined:
         np.testing.assert_array_equal(refined[name].values, few[name].values)

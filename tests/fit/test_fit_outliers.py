@@ -231,11 +231,11 @@ def test_find_outliers__same_for_any_chunks(taken):
 def test_find_outliers__unfitted_and_unseen_surfels_are_nan(taken):
     lumitexels, basis = taken
     broken = lumitexels.isel(surfel=slice(0, 6)).copy(deep=True)
-    broken["basis_weight"].values[0] = np.nan
+    broken["diffuse_reflectance"].values[0] = np.nan
     broken["shading_normal"].values[1] = np.nan
     broken["reflectance_sample"].values[2] = np.nan
     broken["reflectance_sample"].values[3, 0, 0] = np.inf
-    broken["reflectance_sample"].values[4].reshape(-1, 3)[9:] = np.nan
+    broken["reflectance_sample"].values[4].reshape(-1, 3)[2:] = np.nan
     found = find_outliers(broken, basis=basis)["outlier_fraction"].values
     assert np.isnan(found[:5]).all()
     assert np.isfinite(found[5])

@@ -57,9 +57,7 @@ def test_prediction_table__counts_and_weighs_by_area():
         0,
         0,
         1,
-        0,
-        0,
-        0,
+        *[0] * 5,
     ]
     assert table["prediction_surfels"].sel(region="nose", status="diffuse_clamped") == 1
     assert table["prediction_fraction"].sel(region="nose", status="fitted") == 2 / 3

@@ -151,7 +151,7 @@ def test_fit_surface__statuses(planted, small_dictionary):
     normal = lumitexels["shading_normal"].values
     sample[0] = np.nan
     sample[1].reshape(-1, 3)[40:] = np.nan
-    sample[1].reshape(-1, 3)[:35] = np.nan
+    sample[1].reshape(-1, 3)[:38] = np.nan
     diffuse[2] = np.nan
     diffuse[3] = 1e-4
     sample[4, 0, 0] = np.inf
@@ -167,7 +167,7 @@ def test_fit_surface__statuses(planted, small_dictionary):
         FitStatus.DIFFUSE_CLAMPED,
         FitStatus.NOT_FINITE,
         FitStatus.NOT_FINITE,
-        FitStatus.TOO_FEW_SAMPLES,
+        FitStatus.UNDETERMINED,
         FitStatus.FITTED,
     ]
     assert found["fit_status"].values[:8].tolist() == expected

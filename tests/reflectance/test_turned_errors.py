@@ -7,9 +7,10 @@ import pytest
 from scipy.optimize import nnls
 
 from skindb.bench.surface import ETA, strip
-from skindb.fit.surface import MIN_SAMPLES, NOISE_FLOOR_SURFACE
+from skindb.fit.surface import NOISE_FLOOR_SURFACE
 from skindb.optics.angles import half_difference
 from skindb.optics.fresnel import fresnel_transmittance
+from skindb.reflectance._lumitexel_kernels import MIN_SAMPLES_GLOSS
 from skindb.reflectance.dictionary import embedded_dictionary
 from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.model import Comparison, Judgement
@@ -63,7 +64,7 @@ def _refits(model, samples, s, x):
 
 def test_judge__error_of_the_normal_as_refits_of_all_samples(samples):
     model = _mixture()
-    comparison = Comparison("linear", ETA, NOISE_FLOOR_SURFACE, MIN_SAMPLES)
+    comparison = Comparison("linear", ETA, NOISE_FLOOR_SURFACE, MIN_SAMPLES_GLOSS)
     errors = np.zeros((SURFELS, 3))
     given, exact = (
         model.judge(samples.block, comparison, Judgement(errors, normal_error))
@@ -90,7 +91,7 @@ def test_judge__error_of_the_normal_in_cube_root_space_uses_all_samples(samples)
         sample=np.ascontiguousarray(samples.block.sample[:, order]),
         light=np.ascontiguousarray(samples.block.light[order]),
     )
-    comparison = Comparison("perceptual", ETA, NOISE_FLOOR_SURFACE, MIN_SAMPLES)
+    comparison = Comparison("perceptual", ETA, NOISE_FLOOR_SURFACE, MIN_SAMPLES_GLOSS)
     judgement = Judgement(np.zeros((SURFELS, 3)), np.full(SURFELS, TURN))
     one, other = (
         np.diagonal(

@@ -1,0 +1,220 @@
+"""Surfels with 2 to 12 samples, without a scan: planted Lambert's law and one lobe under
+distant lights and one camera, against NumPy's least squares.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from planted_skin import capture_of, make_skin
+
+from skindb.analysis.summary import summary_tables
+from skindb.fit import (
+    FitParameters,
+    estimate_diffuse_reflectance,
+    estimate_normals,
+    fit_model,
+    fit_surface,
+    refine_jointly,
+)
+from skindb.reflectance.mixture import Mixture
+from skindb.render.scene import from_model
+from skindb.schema import FitStatus, dataset
+
+ETA = 1.0  # without a smooth boundary Lambert's law is exact
+FAR_MM = 1e6
+R_D = np.array([0.5, 0.3, 0.2])
+SURFELS = 60
+ROUGHNESS = 0.45  # between the widths of two lobes of the joint fit
+STRENGTH = 2.0
+ISOTROPIC_95 = 1.73  # 95 % of the angles of two equal axes, over their RMS
+
+
+def _unit(v):
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def _lights(count):
+    """Directions around 35 degrees, and from the seventh on at 60."""
+    inner = min(count, 6)
+    ring = np.repeat(np.radians([35.0, 60.0]), [inner, count - inner])
+    ring[:inner:2] -= np.radians(12.0)
+    turn = np.concatenate(
+        [2 * np.pi * np.arange(n) / max(n, 1) for n in (inner, count - inner)]
+    )
+    across = np.sin(ring)
+    return np.stack([across * np.cos(turn), across * np.sin(turn), np.cos(ring)], 1)
+
+
+def _lobe(normal, light):
+    """GGX times the cosine, by Walter et al. (2007) and Smith's joint masking."""
+    view = np.array([0.0, 0.0, 1.0])
+    half = _unit(light + view)
+    ci, co = normal @ light.T, (normal @ view)[:, None]
+    square = ROUGHNESS**2
+    spread = square / (np.pi * ((normal @ half.T) ** 2 * (square - 1) + 1) ** 2)
+    tails = [np.sqrt(1 + square * (1 / c**2 - 1)) for c in (ci, co)]
+    fresnel = ((1.4 - 1) / (1.4 + 1)) ** 2  # nearly constant up to 35 degrees
+    return fresnel * spread * (2 / (tails[0] + tails[1])) / (4 * co)
+
+
+def _planted(light, *, gloss=0.0, noise=0.0, seed=1):
+    """Samples of surfels with normals up to 25 degrees from the camera, and the normals."""
+    rng = np.random.default_rng(seed)
+    normal = _unit(
+        np.array([0.0, 0.0, 1.0]) + 0.2 * rng.uniform(-1, 1, (SURFELS, 3)) * [1, 1, 0]
+    )
+    sample = (normal @ light.T)[:, :, None] * R_D / np.pi
+    sample = sample + gloss * _lobe(normal, light)[..., None]
+    sample = sample * (1 + noise * rng.normal(size=sample.shape))
+    lumitexels = dataset(
+        {
+            "reflectance_sample": sample[:, :, None],
+            "noise_floor": 0.0,
+            "surfel_position": np.zeros((SURFELS, 3)),
+            "surfel_normal": np.tile([0.0, 0.0, 1.0], (SURFELS, 1)),
+            "surfel_area": np.ones(SURFELS),
+            "light_position": FAR_MM * light,
+            "light_disc_radius": np.zeros(len(light)),
+            "camera_position": np.array([[0.0, 0.0, FAR_MM]]),
+        },
+        coords={
+            "channel": ["R", "G", "B"],
+            "light": [f"l{i}" for i in range(len(light))],
+            "camera": ["c0"],
+        },
+    )
+    return lumitexels, normal
+
+
+def _fitted(lumitexels, dictionary, scan_error=60.0):
+    fitted = lumitexels.merge(
+        estimate_normals(lumitexels, eta=ETA, scan_error=scan_error)
+    )
+    fitted = fitted.merge(estimate_diffuse_reflectance(fitted, eta=ETA))
+    fitted = fitted.assign(refine_jointly(fitted, eta=ETA, scan_error=scan_error))
+    surface = Mixture.of_dictionary(dictionary, rank=6)
+    return fitted.merge(fit_surface(fitted, surface=surface, eta=ETA))
+
+
+def _least_squares(lumitexels, light):
+    """Normals and R_d of photometric stereo (Woodham 1980)."""
+    sample = lumitexels["reflectance_sample"].values[:, :, 0].astype(np.float64)
+    scaled = np.linalg.lstsq(light, sample.mean(axis=2).T, rcond=None)[0].T
+    normal = _unit(scaled)
+    shape = (normal @ light.T)[..., None] / np.pi
+    return normal, (sample * shape).sum(axis=1) / (shape**2).sum(axis=1)
+
+
+def _angle(a, b):
+    return np.degrees(np.arccos(np.clip((a * b).sum(axis=1), -1, 1)))
+
+
+@pytest.mark.parametrize("count", [3, 4, 6, 8, 12])
+def test_few_samples__of_lambert_are_those_of_least_squares(count, small_dictionary):
+    light = _lights(count)
+    lumitexels, normal = _planted(light)
+    fitted = _fitted(lumitexels, small_dictionary)
+    expected, diffuse = _least_squares(lumitexels, light)
+    status = FitStatus.LAMBERT if count == 3 else FitStatus.FITTED
+    assert (fitted["fit_status"] == status).all()
+    # the prior of 60 degrees moves normals by up to 0.4
+    assert _angle(fitted["shading_normal"].values, expected).max() < 0.5
+    assert _angle(fitted["shading_normal"].values, normal).max() < 0.5
+    # with 4 to 11, lobes that are nearly even explain a part
+    exact = 0.01 if count in (3, 12) else 0.1
+    np.testing.assert_allclose(fitted["diffuse_reflectance"], diffuse, rtol=exact)
+    weight = fitted["dictionary_weight"].values
+    if count == 3:
+        assert np.isnan(weight).all()
+    else:
+        assert np.median(weight.max(axis=1)) < 0.06
+
+
+@pytest.mark.parametrize("count", [4, 6, 8, 12])
+def test_few_samples__of_a_glossy_surface_are_better_than_lambert(
+    count, small_dictionary
+):
+    light = _lights(count)
+    lumitexels, normal = _planted(light, gloss=STRENGTH)
+    fitted = _fitted(lumitexels, small_dictionary)
+    matt, _ = _least_squares(lumitexels, light)
+    angle = _angle(fitted["shading_normal"].values, normal)
+    assert np.median(angle) < 0.7 * np.median(_angle(matt, normal))
+
+
+@pytest.mark.parametrize("count", [3, 4, 6, 12])
+def test_few_samples__total_errors_cover_the_truth(count, small_dictionary):
+    gloss = 0.0 if count == 3 else STRENGTH / 2
+    lumitexels, normal = _planted(_lights(count), gloss=gloss, noise=0.02)
+    fitted = _fitted(lumitexels, small_dictionary)
+    angle = _angle(fitted["shading_normal"].values, normal)
+    assert (angle < ISOTROPIC_95 * fitted["normal_total_error"].values).mean() > 0.85
+    wrong = np.abs(fitted["diffuse_reflectance"].values - R_D)
+    total = fitted["diffuse_reflectance_total_error"].values
+    assert (wrong < 1.96 * total).mean() > 0.85
+
+
+def test_few_samples__errors_are_wider_for_fewer(small_dictionary):
+    errors = ("normal_error", "normal_total_error", "diffuse_reflectance_total_error")
+    medians = []
+    for count in (4, 12):
+        lumitexels, _ = _planted(_lights(count), noise=0.02)
+        fitted = _fitted(lumitexels, small_dictionary)
+        medians.append([float(np.median(fitted[name])) for name in errors])
+    assert (np.array(medians[0]) > 1.5 * np.array(medians[1])).all()
+
+
+def test_few_samples__lights_in_a_plane_need_a_scan(small_dictionary):
+    turn = np.radians([-60.0, -30.0, 0.0, 30.0, 60.0])
+    light = np.stack([np.sin(turn), np.zeros(5), np.cos(turn)], axis=1)
+    lumitexels, normal = _planted(light)
+    alone = _fitted(lumitexels, small_dictionary)
+    assert (alone["fit_status"] == FitStatus.UNDETERMINED).all()
+    for name in ("shading_normal", "normal_error", "diffuse_reflectance"):
+        assert np.isnan(alone[name]).all()
+    lumitexels["surfel_normal"].values[:] = normal
+    fitted = _fitted(lumitexels, small_dictionary, scan_error=3.0)
+    assert (fitted["fit_status"] == FitStatus.FITTED).all()
+    assert _angle(fitted["shading_normal"].values, normal).max() < 1.0
+
+
+def test_few_samples__two_are_too_few(small_dictionary):
+    lumitexels, normal = _planted(_lights(2))
+    lumitexels["surfel_normal"].values[:] = normal
+    fitted = _fitted(lumitexels, small_dictionary, scan_error=3.0)
+    assert (fitted["fit_status"] == FitStatus.TOO_FEW_SAMPLES).all()
+    assert np.isnan(fitted["diffuse_reflectance"]).all()
+
+
+@pytest.mark.parametrize(
+    ("count", "surface"), [(3, "mixture"), (3, "ggx"), (8, "mixture")]
+)
+def test_fit_model__of_a_few_photographs(count, surface, small_dictionary):
+    """One camera: the model has R_d and normals, and gloss from four samples on."""
+    skin = make_skin(lights=60)
+    chosen = np.linspace(0, 24, count).astype(int)
+    part = skin.lumitexels.isel(light=chosen, camera=[0])
+    capture = capture_of(replace(skin, lumitexels=part), probe=False)
+    size = {"k": 2, "rank": 6} if surface == "mixture" else {}
+    parameters = FitParameters(surface=surface, **size)
+    dictionary = small_dictionary if surface == "mixture" else None
+    model = fit_model(capture, parameters, dictionary=dictionary)
+    fitted = model["fitted"].to_dataset()
+    complete = fitted["fit_samples"].values == count
+    assert complete.mean() >= 0.5
+    status = FitStatus.LAMBERT if count == 3 else FitStatus.FITTED
+    assert (fitted["fit_status"].values[complete] == status).all()
+    wrong = np.abs(fitted["diffuse_reflectance"].values / skin.diffuse - 1)[complete]
+    assert np.median(wrong) < 0.2
+    gloss = fitted["surface_reflectance"].values[complete]
+    assert np.isnan(gloss).all() if count == 3 else (gloss >= 0).all()
+    tables = summary_tables(model)
+    assert np.isfinite(tables["region_diffuse_reflectance"].sel(region="face")).all()
+    assert np.isnan(tables["region_surface_reflectance"].sel(region="face")) == (
+        count == 3
+    )
+    shown = from_model(model).parameters[complete]
+    assert (shown == 0).all() if count == 3 else np.isfinite(shown).all()
