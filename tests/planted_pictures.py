@@ -41,10 +41,12 @@ def sphere_normals() -> NDArray[np.float64]:
     return np.stack([x, y, z], axis=-1) * np.where(np.isfinite(z), 1, np.nan)[..., None]
 
 
-def radiance(light: NDArray[np.float64]) -> NDArray[np.float64]:
+def radiance(
+    light: NDArray[np.float64], albedo: tuple[float, ...] = ALBEDO
+) -> NDArray[np.float64]:
     """Radiance (SIZE, SIZE, 3) below 1 under a distant light."""
     cosine = np.nan_to_num(sphere_normals() @ light)
-    return np.maximum(cosine, 0)[..., None] * np.array(ALBEDO) * 1.6
+    return np.maximum(cosine, 0)[..., None] * np.array(albedo) * 1.6
 
 
 def encoded(
@@ -68,12 +70,16 @@ def write_pictures(
     suffix: str = ".png",
     dtype: str = "uint16",
     srgb: bool = False,
+    albedo: tuple[float, ...] = ALBEDO,
+    gains: NDArray[np.float64] | float = 1.0,
 ) -> list[str]:
-    """Write a picture for each light; their names."""
+    """Write a picture for each light, whose brightness is a gain; their names."""
     folder.mkdir(parents=True, exist_ok=True)
     names = [f"picture {k}{suffix}" for k in range(len(lights))]
-    for name, light in zip(names, lights, strict=True):
-        write_frame(folder / name, encoded(radiance(light), dtype, srgb=srgb))
+    gains = np.broadcast_to(gains, len(lights))
+    for name, light, gain in zip(names, lights, gains, strict=True):
+        picture = gain * radiance(light, albedo)
+        write_frame(folder / name, encoded(picture, dtype, srgb=srgb))
     return names
 
 

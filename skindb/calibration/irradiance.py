@@ -62,8 +62,8 @@ def light_intensities(
     centre: ArrayLike = (0.0, 0.0, 0.0),
 ) -> Float64:
     """Radiant intensity (light, 3) in radiance mm2: given, or I = pi L d^2 /
-    (reflectance cos falloff) by the target; without both, the same for all lights, see
-    `relative_intensity`.
+    (reflectance cos falloff) by the target; without both, that of `relative_intensity`.
+    It is multiplied by the gain of the light.
 
     Raises
     ------
@@ -80,9 +80,10 @@ def light_intensities(
 
     def intensity(light: LightRecord) -> Float64:
         if light.intensity is not None:
-            return light.intensity
+            return light.intensity * light.gain
         if white is None:
-            return relative_intensity(dome, np.asarray(centre, np.float64))
+            middle = np.asarray(centre, np.float64)
+            return relative_intensity(dome, middle) * light.gain
         values = [np.zeros((0, 3))]
         for target in targets:
             merger = mergers[target.camera]
@@ -95,7 +96,7 @@ def light_intensities(
             "no usable pixel",
             "check its position, or give its intensity",
         )
-        return mean
+        return mean * light.gain
 
     return np.array(attempt_all([], intensity, dome.lights, pool=pool))
 

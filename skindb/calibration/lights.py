@@ -55,6 +55,9 @@ ROUNDS = 20
 # corners
 BESIDE_TARGET = 1.05
 THREADS = 2
+# between lights of one rig: more than the rounding of files, less than a lamp that was moved
+SAME_POSITION_MM = 1.0
+SAME_ANGLE = float(np.radians(0.1))
 
 
 @dataclass(frozen=True)
@@ -474,6 +477,52 @@ def calibrated_dome(
         )
     )
     return replace(dome, lights=tuple(calibrated))
+
+
+def is_same_rig(
+    positions: Mapping[str, Float64], others: Mapping[str, Float64]
+) -> bool:
+    """Whether two sets of lights have the same ids, and positions (3,) mm that differ by
+    at most 1 mm, or 0.1 degrees as seen from the origin.
+    """
+    return positions.keys() == others.keys() and all(
+        np.linalg.norm(position - others[name])
+        <= max(SAME_POSITION_MM, SAME_ANGLE * float(np.linalg.norm(position)))
+        for name, position in positions.items()
+    )
+
+
+def rig_positions(rig: xr.Dataset) -> dict[str, Float64]:
+    """Position (3,) mm of each light of the group "rig_calibration"."""
+    positions = rig["rig_light_position"].values
+    return dict(zip(map(str, rig["light"].values), positions, strict=True))
+
+
+def rig_dome(dome: DomeRecord, calibration: xr.Dataset, *, where: str) -> DomeRecord:
+    """The dome with the gains of the lights by a calibration from takes.
+
+    Raises
+    ------
+    InputError
+        If the lights are not those of the calibration.
+    """
+    require(
+        is_same_rig(
+            {light.id: light.position for light in dome.lights},
+            rig_positions(calibration),
+        ),
+        where,
+        "a calibration from takes applies to captures with its lights, within "
+        f"{SAME_POSITION_MM:g} mm or {np.degrees(SAME_ANGLE):.1f} degrees",
+        "other ids or positions of the lights",
+        "remove the key calibration of capture.json, or calibrate from takes of this dome",
+    )
+    gains = calibration["rig_light_gain"].sel(light=[x.id for x in dome.lights]).values
+    lights = (
+        replace(light, gain=float(gain))
+        for light, gain in zip(dome.lights, gains, strict=True)
+    )
+    return replace(dome, lights=tuple(lights))
 
 
 def calibrate_positions(dome: DomeRecord, ball: BallFrames) -> xr.Dataset:

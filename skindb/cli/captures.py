@@ -25,6 +25,7 @@ from skindb.cli.options import (
 )
 from skindb.cli.shared import (
     SCHEDULER,
+    calibrated_by_lines,
     calibration_lines,
     choice_lines,
     each_take,
@@ -256,6 +257,7 @@ def _ingested(
     if surfels := figures.get("surfels"):
         spacing = f"{surfels['spacing_mm']:.2g} mm apart"
         lines.append(f"  {surfels['count']:,} surfels, {spacing}")
+    lines += [f"  {line}" for line in calibrated_by_lines(record.provenance)]
     if "samples" in figures:
         lines += [
             f"  {line}" for line in skindb.ingest.sample_lines(figures["samples"])

@@ -9,7 +9,7 @@ import click
 
 import skindb
 from skindb.cli.options import DB, PATH, PORT, common, options_of
-from skindb.cli.shared import emit, serve, writable
+from skindb.cli.shared import emit, existing, serve, writable
 from skindb.cli.terminal import bar, wait_for_enter
 from skindb.parameters import CalibrationParameters, SessionParameters
 
@@ -78,10 +78,20 @@ def _ask(site: str, number: int) -> None:
 
 @click.command()
 @DB
-@click.argument("setup", type=PATH)
+@click.argument("sources", metavar="[SETUP|TAKE...]", nargs=-1)
+@click.option(
+    "--from-takes",
+    is_flag=True,
+    help="Gains of the lights from fitted takes of a rig.  [default: all takes]",
+)
 @options_of(CalibrationParameters)
 @common
-def calibrate(db: str, setup: Path, parameters: CalibrationParameters) -> None:
+def calibrate(
+    db: str,
+    sources: tuple[str, ...],
+    from_takes: bool,
+    parameters: CalibrationParameters,
+) -> None:
     """Calibrate the lights, cameras and probe of a laboratory.
 
     Lights are calibrated from the frames of the white target in SETUP. If SETUP holds
@@ -90,19 +100,60 @@ def calibrate(db: str, setup: Path, parameters: CalibrationParameters) -> None:
     frames for them exist. If it holds contact/calibration.json, the fibres of the probe
     are located and their gains measured.
 
+    With --from-takes, no set-up is needed: the gains of the lights are what three or
+    more fitted takes have in common. Captures with the same lights use them when they
+    are ingested.
+
     The result is a dated version in the database. Captures that name it (format version
     2, key `calibration`) use its newest version when they are ingested. Earlier
     versions are kept.
     """
-    database = skindb.open(db)
-    record = skindb.workflow.calibrate(database, setup, **vars(parameters))
-    report = skindb.workflow.describe_calibration(database, record)
+    workflow = skindb.workflow
+    if from_takes:
+        database = existing(db)
+        default = CalibrationParameters(parameters.name)
+        if parameters != default:
+            raise click.UsageError(
+                "--fit-falloff and --position-error belong to a SETUP; they have no "
+                "meaning with --from-takes"
+            )
+        record = workflow.calibrate_rig(
+            database, sources, name=parameters.name, progress=bar()
+        )
+        report = workflow.describe_rig(database, record)
+        lines = _rig_lines(record, report)
+    else:
+        if len(sources) != 1:
+            raise click.UsageError("give one SETUP, or --from-takes")
+        database = skindb.open(db)
+        record = workflow.calibrate(database, sources[0], **vars(parameters))
+        report = workflow.describe_calibration(database, record)
+        lines = _calibration_lines(record, report)
+    if report["ingest_again"]:
+        earlier = ", ".join(report["ingest_again"])
+        lines.append(
+            f"  captures that used an earlier calibration and should be ingested again: {earlier}"
+        )
     summary = {
         "calibration": record.take,
         "generation": record.generation,
         "path": record.path,
     }
-    emit(summary | report, _calibration_lines(record, report))
+    emit(summary | report, lines)
+
+
+def _rig_lines(record: Record, report: dict[str, Any]) -> list[str]:
+    """What a calibration from takes found, one line each."""
+    lines = [
+        f"{record.take}: calibration {record.generation} of {report['lights']} lights "
+        f"from {len(report['takes'])} takes, {record.path}",
+        f"  spread of the lights in a held-out take: {report['spread']:.1%} "
+        f"without and {report['spread_left']:.1%} with the gains of the others (medians)",
+        f"  gains are known to {report['largest_relative_error']:.2%} or better",
+    ]
+    if few := report["without_gain"]:
+        lines.append(f"  gain 1, as fewer than three takes show them: {', '.join(few)}")
+    return lines
 
 
 def _calibration_lines(record: Record, report: dict[str, Any]) -> list[str]:
@@ -132,11 +183,6 @@ def _calibration_lines(record: Record, report: dict[str, Any]) -> list[str]:
         lines.append(
             f"  largest change since {record.generation - 1}: "
             f"{report['largest_change']:.2%}, {report['most_changed']}"
-        )
-    if report["ingest_again"]:
-        earlier = ", ".join(report["ingest_again"])
-        lines.append(
-            f"  captures that used an earlier calibration and should be ingested again: {earlier}"
         )
     return lines
 

@@ -326,6 +326,16 @@ def summary_of(record: Record) -> dict[str, Any]:
     return {"generation": record.generation, "path": record.path, **parts}
 
 
+def calibrated_by_lines(provenance: Mapping[str, Any]) -> list[str]:
+    """The calibration that a capture used, and why if the capture does not name it."""
+    if not (used := provenance.get("calibrated_by")):
+        return []
+    reason = (
+        "" if provenance.get("calibration") else ", made from takes with its lights"
+    )
+    return [f"calibration {used['take']}, version {used['generation']}{reason}"]
+
+
 def choice_lines(corrections: Mapping[str, str]) -> list[str]:
     """The corrections that were chosen by trials and why, in one line."""
     choices = [f"{n.replace('_', ' ')} {why}" for n, why in corrections.items()]

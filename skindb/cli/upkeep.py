@@ -15,7 +15,14 @@ import click
 import skindb
 from skindb.bench import KERNELS
 from skindb.cli.options import DB, PATH, asked, common
-from skindb.cli.shared import aligned, calibration_lines, choice_lines, emit, existing
+from skindb.cli.shared import (
+    aligned,
+    calibrated_by_lines,
+    calibration_lines,
+    choice_lines,
+    emit,
+    existing,
+)
 from skindb.cli.subjects import stale_as_json
 from skindb.cli.terminal import bar
 from skindb.errors import Fault, InputError, input_error
@@ -26,6 +33,7 @@ if TYPE_CHECKING:
 ATLAS_WEIGHTS = {
     "intrinsic": "intrinsic weights (Desbrun et al. 2002)",
     "mean_value": "mean-value weights (Floater 2003), because intrinsic ones would flip triangles",
+    "planar": "coordinates of the picture, without a scan",
 }
 
 
@@ -177,9 +185,11 @@ def _atlas_lines(database: Database, take: str) -> list[str]:
 
 
 def _capture_lines(database: Database, take: str) -> list[str]:
-    summary = database.record("capture", take).provenance.get("summary", {})
+    provenance = database.record("capture", take).provenance
+    summary = provenance.get("summary", {})
     parts = (_sample_lines, _atlas_lines, calibration_lines)
     return [
+        *calibrated_by_lines(provenance),
         *[line for part in parts for line in part(database, take)],
         *choice_lines(summary.get("corrections", {})),
     ]

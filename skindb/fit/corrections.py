@@ -41,7 +41,11 @@ NEEDED = ("surfel_position", "surfel_normal", "light_position", "camera_position
 
 
 def estimate_light_gains(
-    lumitexels: xr.Dataset, *, rng: np.random.Generator, eta: float = 1.3
+    lumitexels: xr.Dataset,
+    *,
+    rng: np.random.Generator,
+    eta: float = 1.3,
+    unseen: float = 1.0,
 ) -> xr.Dataset:
     """Ratio of the true to the calibrated intensity of each light, by comparison of
     samples under different lights.
@@ -62,11 +66,13 @@ def estimate_light_gains(
         Selects the surfels that are used.
     eta
         Refractive index of F_t.
+    unseen
+        Gain of lights without usable surfels.
 
     Returns
     -------
     Dataset
-        `light_gain` (light) with median 1; 1 for lights without usable surfels. Errors
+        `light_gain` (light), whose median over the lights with usable surfels is 1. Errors
         of up to 2.5 % remained on captures with known truth: use the gains for lights
         whose intensities are less accurate than this.
 
@@ -108,7 +114,7 @@ def estimate_light_gains(
                 matrix,
             )
     return dataset(
-        {"light_gain": _gains(matrix)},
+        {"light_gain": _gains(matrix, unseen)},
         coords={"light": lumitexels["light"].values}
         if "light" in lumitexels.coords
         else None,
@@ -160,20 +166,20 @@ def _add_view(
     matrix[np.ix_(at, at)] += projected.T @ projected
 
 
-def _gains(matrix: Array) -> Array:
+def _gains(matrix: Array, unseen: float) -> Array:
     """Gains (light,) from the quadratic form (light, light) of the residual in the
-    inverse gains.
+    inverse gains; `unseen` where it has no information.
     """
     information = np.diagonal(matrix)
     if not (information > 0).any():
-        return np.ones(len(matrix))
+        return np.full(len(matrix), unseen)
     prior = PRIOR * float(np.median(information[information > 0]))
     inverse = np.linalg.solve(
         matrix + prior * np.eye(len(matrix)), np.full(len(matrix), prior)
     )
-    gain = np.where(information > 0, 1 / inverse, 1.0)
+    gain = 1 / inverse
     return np.asarray(
-        np.where(information > 0, gain / np.median(gain[information > 0]), 1.0)
+        np.where(information > 0, gain / np.median(gain[information > 0]), unseen)
     )
 
 

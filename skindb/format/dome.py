@@ -103,7 +103,9 @@ class CameraRecord(Pinhole):
 
 @dataclass(frozen=True)
 class LightRecord:
-    """One light; if its intensity is None, the white target determines it."""
+    """One light; if its intensity is None, the white target determines it. Either is
+    multiplied by `gain`, which a calibration from takes of the rig found.
+    """
 
     id: str
     position: Float64
@@ -112,6 +114,7 @@ class LightRecord:
     axis: Float64
     falloff: float
     polarisation: float = 0.0  # as of a camera, of the light that it sends
+    gain: float = 1.0
 
 
 @dataclass(frozen=True)

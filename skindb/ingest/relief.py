@@ -138,8 +138,8 @@ def _grey_pictures(
         radiance[(flag != OK) & ~np.isfinite(radiance).all(axis=-1)] = np.nan
         grey = radiance.mean(axis=-1)[: rows * step, : columns * step]
         grey = grey.reshape(rows, step, columns, step).mean(axis=(1, 3))
-        factor = 1.0 if light.intensity is None else 1 / light.intensity.mean()
-        return np.asarray(grey * factor, np.float32)
+        intensity = 1.0 if light.intensity is None else light.intensity.mean()
+        return np.asarray(grey / (intensity * light.gain), np.float32)
 
     return np.stack(attempt_all([], picture, dome.lights, pool=pool)), step
 

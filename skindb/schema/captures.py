@@ -162,6 +162,10 @@ LIGHT_INTENSITY = declare(
     "radiant intensity in the units of the frames' radiance times mm2",
     f"{PAPER}, section 5",
 )
+LIGHT_GAIN_APPLIED = declare(
+    "float64 dome/light_gain_applied(light) [1]",
+    "gain by a calibration from takes, by which the intensity was multiplied; 1 if absent",
+)
 LIGHT_POLARISATION = declare(
     "float32 dome/light_polarisation(light) [1]",
     "degree of circular polarisation, 1 right-handed, -1 left-handed, 0 without "
@@ -253,6 +257,35 @@ POSITION_RAY_COUNT = declare(
 POSITION_MISS = declare(
     "float64 position_calibration/position_miss(light) [degree]",
     "rms angle by which the rays miss the position",
+)
+
+# rig_calibration
+RIG_LIGHT_POSITION = declare(
+    "float64 rig_calibration/rig_light_position(light, xyz) [mm]",
+    "position of the light in the takes",
+)
+RIG_LIGHT_GAIN = declare(
+    "float64 rig_calibration/rig_light_gain(light) [1]",
+    "true over stated intensity, median over the takes; 1 for lights of fewer than "
+    "three takes",
+)
+RIG_LIGHT_GAIN_ERROR = declare(
+    "float64 rig_calibration/rig_light_gain_error(light) [1]",
+    "its standard error by the scatter of the takes; NaN for lights of fewer than three "
+    "takes",
+)
+RIG_TAKES = declare(
+    "int32 rig_calibration/rig_takes(light) [1]",
+    "takes in which the gain could be estimated",
+)
+RIG_SPREAD = declare(
+    "float64 rig_calibration/rig_spread() [1]",
+    "standard deviation over the lights of the logarithms of the gains of a take; median "
+    "of the takes",
+)
+RIG_SPREAD_LEFT = declare(
+    "float64 rig_calibration/rig_spread_left() [1]",
+    "the same after division by the common gains of the other takes",
 )
 
 # probe_calibration

@@ -12,6 +12,7 @@ from skindb.errors import Fault, InputError, input_error
 from skindb.schema.consent import CONSENT, consent_scope
 from skindb.store.log import Log
 from skindb.store.place import (
+    CALIBRATION,
     KINDS_OF_ONE_SUBJECT,
     KINDS_WITHOUT_SUBJECT,
     RELEASE,
@@ -29,6 +30,7 @@ REQUIRED_SCOPES = {
     "registration": "statistics",
     STUDY: "statistics",
     "edit": "statistics",
+    CALIBRATION: "fit",
 }
 
 
@@ -114,7 +116,7 @@ def require_consents(
         if reference["kind"] not in KINDS_WITHOUT_SUBJECT
     ]
     subjects = {subject_of(reference["take"]) for reference in of_takes}
-    subjects |= set() if kind == STUDY else {subject_of(take)}
+    subjects |= set() if kind in KINDS_WITHOUT_SUBJECT else {subject_of(take)}
     faults = []
     for subject in sorted(subjects):
         log = Log(place, CONSENT, subject)

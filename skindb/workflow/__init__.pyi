@@ -43,6 +43,7 @@ from .pictures import (
     view_takes,
 )
 from .quick import quick
+from .rig import calibrate_rig, describe_rig
 from .session import capture_session, plan_session
 from .simulation import begin_cohort, simulate, simulate_one
 from .studies import STUDY_FUNCTIONS, study
@@ -69,6 +70,7 @@ __all__ = [
     "basis_grid",
     "begin_cohort",
     "calibrate",
+    "calibrate_rig",
     "capture_session",
     "captured_subjects",
     "clean",
@@ -78,6 +80,7 @@ __all__ = [
     "create_release",
     "dashboard_link",
     "describe_calibration",
+    "describe_rig",
     "dictionary_at",
     "edit",
     "edit_grid",

@@ -19,7 +19,10 @@ from skindb.calibration.lights import (
     calibrate_lights,
     calibrate_positions,
     calibrated_dome,
+    is_same_rig,
     positioned_dome,
+    rig_dome,
+    rig_positions,
 )
 from skindb.calibration.setup import (
     read_calibration_frames,
@@ -57,10 +60,12 @@ from skindb.workflow.audit import logged_action
 from skindb.workflow.derive import groups_of
 
 NOTE = "stage"  # file in the scratch folder: path of the data that this run writes
+RIG = "rig_calibration"  # group of a calibration from takes
 # group of a calibration -> function that applies it to a dome
 APPLIED: dict[str, Callable[..., DomeRecord]] = {
     "position_calibration": positioned_dome,
     "light_calibration": calibrated_dome,
+    RIG: rig_dome,
     "camera_calibration": calibrated_cameras,
 }
 
@@ -254,6 +259,7 @@ def calibrate(
     """
     chosen = CalibrationParameters(name, **options)
     key = require_text(name, NAME.pattern, "name of a calibration")
+    require_kind_of_calibration(db, key, rig=False)
     dome = read_setup_dome(Path(setup))
     groups = dict[str, xr.Dataset]()
     if frames := read_calibration_frames(dome):
@@ -289,11 +295,49 @@ def calibrate(
         return stage.commit(provenance)
 
 
+def require_kind_of_calibration(db: Database, name: str, *, rig: bool) -> None:
+    """Require that earlier versions of a calibration are from takes (`rig`) too, or from
+    a set-up too.
+    """
+    is_rig = db.has(CALIBRATION, name) and RIG in db.record(CALIBRATION, name).contents
+    require(
+        not db.has(CALIBRATION, name) or is_rig == rig,
+        f"calibration {name}",
+        "all versions must be from takes, or all from set-ups",
+        "earlier versions from " + ("takes" if is_rig else "set-ups"),
+        "choose another name",
+    )
+
+
+def rigs_of(db: Database, dome: DomeRecord) -> list[str]:
+    """Names of the calibrations from takes whose lights are those of a dome."""
+    lights = {light.id: light.position for light in dome.lights}
+    return [
+        name
+        for name in db.takes(CALIBRATION)
+        if RIG in db.record(CALIBRATION, name).contents
+        and is_same_rig(
+            lights, rig_positions(db.read(CALIBRATION, name)[RIG].to_dataset())
+        )
+    ]
+
+
 def calibrated_capture(db: Database, capture: Capture) -> Capture:
-    """The capture with the newest version of the calibration that it names, if it names one."""
+    """The capture with the newest version of the calibration that it names, or else of
+    the only calibration from takes that has its lights.
+    """
     name = capture.calibration
     dome = capture.dome
     probe = capture.probe
+    if not name and dome is not None:
+        rigs = rigs_of(db, dome)
+        if len(rigs) > 1:
+            line = (
+                f"gains of the lights: calibrations {' and '.join(rigs)} have the same "
+                "lights; name one in capture.json"
+            )
+            return replace(capture, skipped=(*capture.skipped, line))
+        name = "".join(rigs)
     if not name or (dome is None and probe is None):
         return capture
     if not db.has(CALIBRATION, name):

@@ -219,3 +219,22 @@ def test_position_sensitivity__is_the_gradient_of_the_inverse_square_and_the_cos
     )
     # a step of 1 mm from 740 mm is nearly linear
     np.testing.assert_allclose(change, expected, rtol=0.01)
+
+
+@pytest.mark.parametrize("source", ["given", "white target", "relative"])
+def test_light_intensities__are_multiplied_by_the_gain_of_the_light(pristine, source):
+    dome = read_capture(pristine).dome
+    if source == "given":
+        lights = tuple(replace(x, intensity=np.array([3.0, 2, 1])) for x in dome.lights)
+        dome = replace(dome, lights=lights)
+    if source == "relative":
+        dome = replace(dome, white=None)
+    gains = np.linspace(0.8, 1.3, len(dome.lights))
+    lights = (replace(x, gain=g) for x, g in zip(dome.lights, gains, strict=True))
+    brighter = replace(dome, lights=tuple(lights))
+    with ThreadPoolExecutor(2) as pool:
+        plain, changed = (
+            light_intensities(each, frame_mergers(each, []), pool)
+            for each in (dome, brighter)
+        )
+    np.testing.assert_allclose(changed, plain * gains[:, None], rtol=1e-12)

@@ -1,0 +1,205 @@
+"""Calibration of a rig from its own fitted takes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from skindb.calibration.lights import is_same_rig
+from skindb.errors import input_error, require
+from skindb.fit.rig import MIN_TAKES, common_light_gains, take_light_gains
+from skindb.format.fields import NAME
+from skindb.schema import variables
+from skindb.store import CALIBRATION, Database, Record, require_text
+from skindb.types import Float64, Progress, silent
+from skindb.workflow.audit import logged_action
+from skindb.workflow.captures import RIG, require_kind_of_calibration, takes_of_earlier
+from skindb.workflow.fit import current_model, takes_without_consent
+
+
+def calibrate_rig(
+    db: Database,
+    takes: Sequence[str] = (),
+    *,
+    name: str,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> Record:
+    """Estimate the gains of the lights that all takes of a rig have in common, and commit
+    them as the next version of the calibration of that name.
+
+    A take that is ingested later without the name of a calibration, with the same lights,
+    uses them. Gains with which the takes themselves were ingested are divided out.
+
+    Parameters
+    ----------
+    db
+        Database with fitted takes of the rig.
+    takes
+        Names of takes; default all whose newest capture is fitted, and whose subjects
+        consent to fits.
+    name
+        Name of the calibration.
+    seed
+        Random seed of the surfels that are used.
+    progress
+        Called with the stage, the number of finished steps and the total number of steps.
+
+    Returns
+    -------
+    Record
+        Of the commit; the version has the group "rig_calibration".
+
+    Raises
+    ------
+    InputError
+        If there are fewer than three takes, if they are not of one rig or not fitted, or
+        if the common gains do not predict a held-out take. Nothing is stored
+        then.
+    """
+    key = require_text(name, NAME.pattern, "name of a calibration")
+    require_kind_of_calibration(db, key, rig=True)
+    models = _models(db, takes)
+    require(
+        len(models) >= MIN_TAKES,
+        "calibration from takes",
+        f"at least {MIN_TAKES} takes must have a model of their newest capture",
+        ", ".join(models) or "none",
+        "ingest and fit more takes of the rig",
+    )
+    inputs = list[Record]()
+    gains = list[Any]()
+    positions = dict[str, Float64]()
+    for number, (take, model) in enumerate(models.items()):
+        progress("gains", number, len(models))
+        capture = db.read("capture", take)
+        record = db.record("capture", take, capture.attrs["generation"])
+        lights = _lights(record, capture)
+        positions = positions or lights
+        _require_rig(positions, lights, take=take, first=next(iter(models)))
+        rng = np.random.default_rng([seed, number])
+        fitted = db.read("model", take, generation=model.generation)
+        own = dict(zip(lights, take_light_gains(capture, fitted, rng=rng), strict=True))
+        gains.append([own[light] for light in positions])
+        inputs += [record, model]
+    group = common_light_gains(
+        np.array(gains), lights=[*positions], positions=np.array([*positions.values()])
+    )
+    _require_help(group)
+    progress("gains", len(models), len(models))
+    provenance = {
+        "command": "calibrate",
+        "parameters": {"takes": [*models]},
+        "seeds": {"calibrate": seed},
+        "inputs": [record.as_input() for record in inputs],
+    }
+    stage = db.stage(CALIBRATION, key, names=[*models])
+    with logged_action(db, "calibrate", [*models]), stage:
+        stage.write({RIG: group})
+        return stage.commit(provenance)
+
+
+def describe_rig(db: Database, record: Record) -> dict[str, Any]:
+    """Gains of a calibration from takes: their spread, errors, and the spread that they
+    leave in a held-out take.
+    """
+    stored = db.read(CALIBRATION, record.take, generation=record.generation)
+    rig = stored[RIG].to_dataset().load()
+    count = rig[variables.RIG_TAKES].values
+    few = rig["light"].values[count < MIN_TAKES]
+    return {
+        "lights": rig.sizes["light"],
+        "takes": record.provenance["parameters"]["takes"],
+        "largest_relative_error": float(rig[variables.RIG_LIGHT_GAIN_ERROR].max()),
+        "spread": float(rig[variables.RIG_SPREAD]),
+        "spread_left": float(rig[variables.RIG_SPREAD_LEFT]),
+        "without_gain": [str(light) for light in few],
+        "ingest_again": takes_of_earlier(db, record),
+    }
+
+
+def _models(db: Database, takes: Sequence[str]) -> dict[str, Record]:
+    """The models of the takes, or of all that can be used."""
+    if not takes:
+        refused = takes_without_consent(db)
+        allowed = [take for take in db.takes("model") if take not in refused]
+        models = {take: current_model(db, take) for take in allowed}
+        return {take: model for take, model in models.items() if model is not None}
+    found = dict[str, Record]()
+    for take in takes:
+        db.record("capture", take)
+        model = current_model(db, take)
+        if model is None:
+            raise input_error(
+                take,
+                "a calibration needs a model of the newest capture",
+                "none",
+                "run skindb fit first",
+            )
+        found[take] = model
+    return found
+
+
+def _lights(record: Record, capture: xr.DataTree) -> dict[str, Float64]:
+    """Position (3,) mm of each light of a capture, whose intensities must be its own."""
+    take = record.take
+    rule = "a calibration from takes needs captures with a dome"
+    require("dome" in capture.children, take, rule, "none", "name other takes")
+    dome = capture["dome"].to_dataset()
+    is_from_setup = (
+        record.provenance.get("calibrated_by")
+        and variables.LIGHT_GAIN_APPLIED not in dome
+    )
+    require(
+        not is_from_setup,
+        take,
+        "takes of a rig must have intensities of their own or of a calibration from takes",
+        f"those of calibration {record.provenance.get('calibration')}",
+        "name other takes",
+    )
+    positions = dome[variables.LIGHT_POSITION].values.astype(np.float64)
+    return dict(zip(map(str, dome["light"].values), positions, strict=True))
+
+
+def _require_rig(
+    positions: dict[str, Float64],
+    lights: dict[str, Float64],
+    *,
+    take: str,
+    first: str,
+) -> None:
+    """Require the lights of another take of the rig."""
+    if is_same_rig(positions, lights):
+        return
+    other = positions.keys() ^ lights.keys()
+    name = (
+        min(other)
+        if other
+        else next(
+            light
+            for light, position in positions.items()
+            if not is_same_rig({light: position}, {light: lights[light]})
+        )
+    )
+    raise input_error(
+        take,
+        f"takes of one rig must have the lights of {first}",
+        f"light {name} in one of them only" if other else f"light {name} elsewhere",
+        "name the takes of one rig",
+    )
+
+
+def _require_help(group: xr.Dataset) -> None:
+    """Require that the common gains predict a held-out take."""
+    spread = float(group[variables.RIG_SPREAD])
+    left = float(group[variables.RIG_SPREAD_LEFT])
+    require(
+        left < spread,
+        "calibration from takes",
+        "common gains must lower the spread of the lights in a held-out take",
+        f"{spread:.1%} without them and {left:.1%} with them",
+        "nothing was stored: more takes may help, or the intensities are good as they are",
+    )
