@@ -4,6 +4,7 @@ al. 2005, section 10.2).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +29,7 @@ from skindb.render.image import tone_map
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.notes import Note, note
-from skindb.types import Array, Float64, Index, Mask
+from skindb.types import Array, Bytes, Float64, Index, Mask
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -153,7 +154,7 @@ def principal_components(
     """Mean, principal axes and scores of the takes of a cohort.
 
     Every take is read by its own tasks. The vectors of all takes are kept in memory in
-    their own precision (550 MB for 174 maps of 512 x 512 texels).
+    their own precision (at most 550 MB for 174 maps of 512 x 512 texels).
 
     Parameters
     ----------
@@ -194,7 +195,7 @@ def principal_components(
     # the mean uses up one dimension: one more axis would be rounding error
     max_components = min(max_components, max(len(rows) - 1, 1))
     axes = principal_axes(
-        np.stack(each_take(_used_entries, cohort.isel(take=rows), ["values"], once)),
+        each_take(_used_entries, cohort.isel(take=rows), ["values"], once),
         max_components,
     )
     ratio = axes.variance / (axes.total or 1.0)
@@ -242,7 +243,8 @@ def _usable_entries(
         If there are fewer than two takes, or if no entry is known in all of them.
     """
     finite = each_take(_finite_entries, cohort, ["values"])
-    fraction = np.array([entries.mean() for entries in finite])
+    entries = math.prod(cohort["values"].shape[1:])
+    fraction = np.array([np.bitwise_count(bits).sum() for bits in finite]) / entries
     rows = np.flatnonzero((fraction >= least_known) & (fraction > 0))
     skipped = [
         note(str(take), f"only {fraction[i]:.0%} of its entries are known")
@@ -256,7 +258,8 @@ def _usable_entries(
             f"{len(rows)} of {len(finite)}",
             "fit or register more takes",
         )
-    is_used: Mask = np.logical_and.reduce([finite[i] for i in rows])
+    used_bits = np.bitwise_and.reduce([finite[i] for i in rows])
+    is_used = np.unpackbits(used_bits, count=entries).astype(bool)
     require(
         is_used.any(),
         "principal components",
@@ -267,8 +270,9 @@ def _usable_entries(
     return rows, is_used, skipped
 
 
-def _finite_entries(take: xr.Dataset) -> Mask:
-    return np.asarray(np.isfinite(take["values"].values).ravel())
+def _finite_entries(take: xr.Dataset) -> Bytes:
+    """Mask of the known entries of a take, one bit each."""
+    return np.packbits(np.isfinite(take["values"].values).ravel())
 
 
 def _used_entries(take: xr.Dataset, is_used: Mask) -> Array:

@@ -23,8 +23,8 @@ MAX_PASSES = 30  # over all blocks; each pass reads all data
 # relative decrease of the error by a pass, below which no further pass is made
 MIN_FALL_PER_PASS = 1e-3
 SWEEPS_PER_PASS = 5  # over all rows of H between two passes; their cost is negligible
-# entries per vector that are held in double precision at a time: 90 MB for 174 vectors
-BLOCK = 1 << 16
+# entries per vector that are held in double precision at a time: 23 MB for 174 vectors
+BLOCK = 1 << 14
 
 
 @dataclass(frozen=True)
@@ -278,27 +278,28 @@ class Components:
     residual: Array  # (n,) root mean square of the residual of each vector
 
 
-def principal_axes(vectors: Array, max_components: int) -> Components:
+def principal_axes(vectors: Sequence[Array], max_components: int) -> Components:
     """Principal components of vectors (n, d), n at least 2, from the eigenvectors of
     their inner products.
 
-    Vectors are read block by block, so that no full copy in double precision is needed.
+    Vectors are read block by block, so that no second copy of them is needed.
     Components whose variance is below 1e-12 of the largest are rounding and are
     dropped.
 
     Parameters
     ----------
     vectors
-        (n, d) finite, of any precision.
+        (n, d) finite, of any precision, as one array or as n.
     max_components
         Maximum number of components; never more than n - 1.
     """
-    n, d = vectors.shape
+    n = len(vectors)
+    d = len(vectors[0])
     blocks = [slice(start, start + BLOCK) for start in range(0, d, BLOCK)]
     mean = np.empty(d)
     inner = np.zeros((n, n))
     for block in blocks:
-        x = vectors[:, block].astype(float)
+        x = np.stack([vector[block] for vector in vectors]).astype(float)
         mean[block] = x.mean(axis=0)
         x -= mean[block]
         inner += x @ x.T
@@ -310,7 +311,7 @@ def principal_axes(vectors: Array, max_components: int) -> Components:
     axes = np.empty((rank, d))
     residual = np.zeros(n)
     for block in blocks:
-        x = vectors[:, block] - mean[block]
+        x = np.stack([vector[block] for vector in vectors]) - mean[block]
         axes[:, block] = (places / length).T @ x
         residual += ((x - (places * length) @ axes[:, block]) ** 2).sum(axis=1)
     largest = np.abs(axes).argmax(axis=1)
