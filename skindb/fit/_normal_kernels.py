@@ -26,6 +26,10 @@ COMBINED, CHROMATIC, PHOTOMETRIC = range(3)
 # degrees
 NOISE_FACTOR_NORMAL = 3.0
 MODEL_ERROR_DEGREES = 1.0
+# Standard error [rad] beyond which the chromatic estimate is that of noise: of a gray
+# sphere under 12 lights, where it is wrong by 67 degrees on average, the combination is
+# then wrong by 6.0 degrees instead of 6.6 (photometric alone 5.5).
+MAX_ERROR_CHROMATIC = math.radians(5.0)
 # Larger ones say that the lights do not determine the normal: lights in a plane and no
 # scan give 42.
 MAX_ERROR_DEGREES = 30.0
@@ -88,16 +92,19 @@ def _unit_normal(scan: Vector, out: Vector) -> None:
 
 
 @kernel
-def _combine(estimates: NormalEstimates, out: Vector) -> float:
+def _combine(estimates: NormalEstimates, scan_error: float, out: Vector) -> float:
     """Write the mean of both estimates by inverse variance; returns the weight of the
     photometric one.
 
-    The variance is that of the residuals relative to the signal; for skin without
-    colour the photometric estimate has all the weight.
+    The variance is that of the residuals relative to the signal. Without colour, or
+    with less than its noise, the photometric estimate has all the weight.
     """
     spread = estimates.spread
     white = 1.0 / spread[0] ** 2 if spread[0] == spread[0] else 0.0
     tinted = 1.0 / spread[1] ** 2 if spread[1] == spread[1] else 0.0
+    variance = _variance(0.0, estimates, scan_error)
+    if white > 0.0 and variance > MAX_ERROR_CHROMATIC**2:
+        tinted = 0.0
     share = white / max(white + tinted, 1e-300)
     if white + tinted > 0.0:
         _mean(share, estimates.normal, out)
@@ -166,7 +173,7 @@ def normals_block(
             b,
             estimates,
         )
-        share = _combine(estimates, combined)
+        share = _combine(estimates, scan_error, combined)
         if method == PHOTOMETRIC:
             share = 1.0
         elif method == CHROMATIC:

@@ -51,6 +51,17 @@ def test_estimate_normals__colourless_skin_falls_back_on_shading(new_skin):
     assert np.median(_angles(found, grey.normal)) < 0.8
 
 
+def test_estimate_normals__colour_below_the_noise_is_ignored(new_skin):
+    """Under 12 lights and one camera, without a scan."""
+    grey = new_skin(grey=True, noise=0.04, gloss=0.0, lights=60)
+    part = grey.lumitexels.isel(light=slice(0, 36, 3), camera=[0])
+    means = []
+    for method in ("photometric", "combined"):
+        found = estimate_normals(part, method=method, scan_error=60.0)
+        means.append(np.nanmean(_angles(found["shading_normal"].values, grey.normal)))
+    assert means[1] < 1.02 * means[0]
+
+
 def test_estimate_normals__rotates_with_the_scene(skin):
     turn = Rotation.from_rotvec([0.3, -0.5, 0.8])
     names = ("surfel_position", "surfel_normal", "light_position", "camera_position")
