@@ -283,7 +283,9 @@ def cat_rows(photographs: Photographs) -> list[list[str]]:
 
 
 def light_rows(photographs: Photographs) -> list[list[str]]:
-    """Errors of the cat by the number of training lights."""
+    """Errors of the cat by the number of training lights, of all models at the pixels for
+    which skindb has one.
+    """
     rows = [
         [
             "cat: normals, mean [deg] / held-out lights [%]",
@@ -291,26 +293,27 @@ def light_rows(photographs: Photographs) -> list[list[str]]:
         ]
     ]
     training = np.flatnonzero(~photographs.held_out)
+    known = dict[int, Mask]()
     for name, method in methods(SKIN).items():
         cells = []
         for count in LIGHT_COUNTS:
             chosen = np.zeros(len(photographs.light), np.bool_)
             chosen[training[spread_lights(photographs.light[training], count)]] = True
-            cells.append(_few_lights(photographs, method, chosen))
+            fitted = method(photographs, chosen)
+            if name == "skindb":
+                known[count] = np.isfinite(fitted.predicted).any(axis=1)
+            cells.append(_errors_at(photographs, fitted, known[count]))
         rows.append([name, *cells])
-    return rows
+    fractions = [f"{100 * known[count].mean():.0f}" for count in LIGHT_COUNTS]
+    return [*rows, ["pixels with a model of skindb [%]", *fractions]]
 
 
-def _few_lights(photographs: Photographs, method: Method, chosen: Mask) -> str:
-    try:
-        fitted = method(photographs, chosen)
-    except ValueError:  # of skindb: no surfel could be fitted
-        return "no model"
-    angle = np.nanmean(angles(fitted.normal, photographs.normal))
-    return (
-        f"{angle:.1f} / "
-        f"{prediction_error(photographs, fitted.predicted, photographs.held_out):.1f}"
-    )
+def _errors_at(photographs: Photographs, fitted: Fitted, known: Mask) -> str:
+    """Mean angle and prediction error at some pixels."""
+    angle = np.nanmean(angles(fitted.normal, photographs.normal)[known])
+    predicted = np.where(known[:, None], fitted.predicted, np.nan)
+    error = prediction_error(photographs, predicted, photographs.held_out)
+    return f"{angle:.1f} / {error:.1f}"
 
 
 def sphere_rows(photographs: Photographs) -> list[list[str]]:
