@@ -31,6 +31,9 @@ SHADOW_FRACTION = 0.08
 BRIGHT_QUANTILE = 0.9
 # of the brightest pixels; pixels that no light brightens further are background
 BACKGROUND_FRACTION = 0.02
+# so are dark ones that all lights show alike, as black levels and ambient light do
+DIM_FRACTION = 0.15
+MIN_CHANGE = 0.1
 # smallest over largest eigenvalue of the lights' directions, below which they are in a plane
 MIN_SPREAD = 2e-3
 ROUNDS = 5  # of reweighting; the weights of a sixth differ by less than a percent
@@ -146,8 +149,14 @@ def _grey_pictures(
 
 def _lit(values: NDArray[np.float32]) -> Mask:
     """Where (light, rows, columns) a picture shows light, neither shadow nor saturation."""
-    bright = np.nanquantile(np.nan_to_num(values), BRIGHT_QUANTILE, axis=0)
-    shown = bright > BACKGROUND_FRACTION * np.quantile(bright, 0.99)
+    low, bright = np.quantile(
+        np.nan_to_num(values), (1 - BRIGHT_QUANTILE, BRIGHT_QUANTILE), axis=0
+    )
+    top = np.quantile(bright, 0.99)
+    changes = bright - low > MIN_CHANGE * bright
+    shown = (bright > BACKGROUND_FRACTION * top) & (
+        changes | (bright > DIM_FRACTION * top)
+    )
     return np.asarray(
         np.isfinite(values) & (values > SHADOW_FRACTION * bright) & (values > 0) & shown
     )

@@ -275,6 +275,22 @@ def test_lights_in_a_plane_are_refused(tmp_path: Path) -> None:
         ingested(tmp_path / "capture", tmp_path)
 
 
+def test_a_background_of_one_dim_value_is_no_surface(tmp_path: Path) -> None:
+    """Such as a black level that nobody stated."""
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    names = [f"{k}.png" for k in range(len(LIGHTS))]
+    for name, light in zip(names, LIGHTS, strict=True):
+        picture = np.maximum(radiance(light), 0.06)
+        write_frame(folder / name, encoded(picture, "uint16", srgb=False))
+    write_table(folder / "lights.csv", names, LIGHTS)
+    import_images(folder, tmp_path / "capture", PERSON, width_mm=SIZE)
+    tree = ingested(tmp_path / "capture", tmp_path)
+    place = tree["surfels"]["surfel_position"].values[:, :2]
+    # the radius of the sphere is 20 mm
+    assert np.linalg.norm(place, axis=1).max() < 21
+
+
 def test_a_light_stage(tmp_path: Path) -> None:
     """One camera by COLMAP's text model, pictures as LIGHT_CAMERA."""
     source = tmp_path / "stage"
