@@ -62,6 +62,7 @@ ISOTROPIC_95 = float(np.sqrt(-np.log(0.05)))
 MIN_PREDICTED = 0.01
 GAIN_ROUNDS = 3
 BASES = 4
+FEW_LIGHTS = 8
 LIGHT_COUNTS = (4, 6, 8, 12, 24)
 PARTS = ("faces", "cat", "lights", "sphere", "brdfs")
 
@@ -231,7 +232,14 @@ def face_rows(people: list[Photographs]) -> list[list[str]]:
         for person in people
     ]
     title = f"{len(people)} faces: error at held-out lights [%]"
-    rows = [[title, "raw", "scaled", "own gains, scaled", "gains of others"]]
+    columns = (
+        "raw",
+        "scaled",
+        "own gains, scaled",
+        "gains of others",
+        "the same, 8 lights",
+    )
+    rows = [[title, *columns]]
     for name, method in methods(SKIN).items():
         cells = []
         for k, person in enumerate(people):
@@ -243,12 +251,14 @@ def face_rows(people: list[Photographs]) -> list[list[str]]:
             raw, balanced, common = (
                 method(part, training).predicted for part in (person, equalised, shared)
             )
+            few = method(shared, spread(person, FEW_LIGHTS)).predicted
             cells.append(
                 [
                     prediction_error(person, raw, person.held_out),
                     prediction_error(person, raw, person.held_out, scaled=True),
                     prediction_error(equalised, balanced, person.held_out, scaled=True),
                     prediction_error(shared, common, person.held_out),
+                    prediction_error(shared, few, person.held_out),
                 ]
             )
         rows.append([name, *(f"{value:.1f}" for value in np.mean(cells, axis=0))])
@@ -292,20 +302,25 @@ def light_rows(photographs: Photographs) -> list[list[str]]:
             *(f"{n} lights" for n in LIGHT_COUNTS),
         ]
     ]
-    training = np.flatnonzero(~photographs.held_out)
     known = dict[int, Mask]()
     for name, method in methods(SKIN).items():
         cells = []
         for count in LIGHT_COUNTS:
-            chosen = np.zeros(len(photographs.light), np.bool_)
-            chosen[training[spread_lights(photographs.light[training], count)]] = True
-            fitted = method(photographs, chosen)
+            fitted = method(photographs, spread(photographs, count))
             if name == "skindb":
                 known[count] = np.isfinite(fitted.predicted).any(axis=1)
             cells.append(_errors_at(photographs, fitted, known[count]))
         rows.append([name, *cells])
     fractions = [f"{100 * known[count].mean():.0f}" for count in LIGHT_COUNTS]
     return [*rows, ["pixels with a model of skindb [%]", *fractions]]
+
+
+def spread(photographs: Photographs, count: int) -> Mask:
+    """Training lights (light,) in directions that are far from each other."""
+    training = np.flatnonzero(~photographs.held_out)
+    chosen = np.zeros(len(photographs.light), np.bool_)
+    chosen[training[spread_lights(photographs.light[training], count)]] = True
+    return chosen
 
 
 def _errors_at(photographs: Photographs, fitted: Fitted, known: Mask) -> str:

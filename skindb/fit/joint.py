@@ -32,7 +32,7 @@ from skindb.types import Array
 # Factors of the errors by device and by samples, and an angle [degree], of which the total
 # error of a normal consists. Chosen on six captures with known truth, where 93 to 99 % of
 # the angles were below 1.73 times it with a whole step of the normal; not chosen on the
-# cat of DiLiGenT, where 92 % are (docs/validation.md).
+# cat of DiLiGenT, where 88 % are (docs/validation.md).
 TOTAL_SHARED = 2.0
 TOTAL_NOISE = 6.0
 TOTAL_ANGLE = 0.5
