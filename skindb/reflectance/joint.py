@@ -1,12 +1,12 @@
 """Joint fit of the normal, R_d and the surface to the samples of surfels.
 
 A sample is cos(theta_i) (F_t F_t R_d / pi + sum_j x_j b_j) with R_d >= 0 of three channels
-and strengths x_j >= 0 of GGX lobes b_j of graded widths. Given the normal this is a
-non-negative least-squares problem; the normal is refined with all other parameters by
-Gauss-Newton steps. Surfels with few samples have one lobe, or none. Weights are those of a comparison of cube roots, less for noisy samples
-and for outliers (Tukey's function). A surfel has no lobes narrower than 2/3 of the
-smallest angle at which it was seen from its normal to a half vector: their peaks would be
-extrapolated.
+and strengths x_j >= 0 of GGX lobes b_j of graded widths; surfels with few samples have one
+lobe, or none. Given the normal this is a non-negative least-squares problem; the normal is
+refined with all other parameters by Gauss-Newton steps. Weights are those of a comparison
+of cube roots, less for noisy samples and for outliers (Tukey's function). A surfel has no
+lobes narrower than 2/3 of the smallest angle at which it was seen from its normal to a half
+vector: their peaks would be extrapolated.
 """
 
 from __future__ import annotations
