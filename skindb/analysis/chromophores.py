@@ -658,6 +658,7 @@ STUDY = Study(
     name="chromophores",
     description="melanin and haemoglobin in maps of albedo, and the mean face",
     layout="maps",
+    absolute=True,
     parameters=Parameters,
     compute=compute,
     shown=("chromophores", "chromophore_table"),

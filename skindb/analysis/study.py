@@ -164,6 +164,8 @@ class Study:
         Further options of `Database.cohort`.
     uses_registration
         Whether takes with landmarks are registered first, as for maps always.
+    absolute
+        Whether it needs absolute reflectance.
     compares_normal
         Whether it compares subjects in the condition normal, so that those without such
         a take are reported as skipped.
@@ -181,6 +183,7 @@ class Study:
     columns_of_files: tuple[str, ...] = ()
     cohort_options: Mapping[str, Any] = field(default_factory=dict)
     uses_registration: bool = False
+    absolute: bool = False
     compares_normal: bool = False
 
     @property

@@ -272,6 +272,7 @@ def second_pass(
         "suspects": suspects(outliers, fitted_part(samples, held_out)),
         "corrections": first.attrs["corrections"],
         "skipped": first.attrs["skipped"],
+        "relative_reflectance": relative_reflectance(samples),
         "seconds": {**first.attrs["seconds"], **timer.seconds},
     }
     return model

@@ -146,6 +146,25 @@ def _require_models(db: Database, takes: Sequence[str], release: str | None) -> 
     summarise(db, [take for take in takes or models if take in models], release=release)
 
 
+def _require_one_scale(study: Study, inputs: Sequence[Record]) -> None:
+    """Refuse models whose reflectance cannot be compared: with and without a white target,
+    or without one where absolute values are needed.
+    """
+    models = [record for record in inputs if record.kind == "model"]
+    relative = [x.take for x in models if x.provenance.get("relative_reflectance")]
+    if not relative or (len(relative) == len(models) and not study.absolute):
+        return
+    rule = "all takes of a study must have absolute reflectance, or all relative"
+    if study.absolute:
+        rule = f"the study {study.name} needs absolute reflectance"
+    raise input_error(
+        ", ".join(relative[:3]) + (", ..." if len(relative) > 3 else ""),
+        rule,
+        f"{len(relative)} of {len(models)} takes without a white target",
+        "name takes of one kind with --take",
+    )
+
+
 def _open_maps(
     db: Database,
     models: xr.Dataset,
@@ -294,6 +313,7 @@ def study(
         population, inputs = open_population(
             db, record, takes=takes, release=release, dictionary=dictionary
         )
+        _require_one_scale(record, inputs)
         derivation = _derivation(db, key, record, requested, population, inputs)
         # the file of a dictionary may change: a study with one is always computed
         if dictionary is not None or derivation.current() is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import subprocess
 import sys
 from contextlib import redirect_stderr, redirect_stdout
@@ -13,8 +14,13 @@ import numpy as np
 import pytest
 from planted_pictures import directions, sphere_normals, write_pictures, write_table
 
+import skindb
+from skindb.analysis import STUDIES
 from skindb.cli import main
+from skindb.errors import InputError
+from skindb.ingest import import_images
 from skindb.render.image import read_exr, read_png
+from skindb.workflow.studies import _require_one_scale
 
 LIGHTS = directions(13)
 
@@ -98,3 +104,26 @@ def test_wrong_imports_are_one_line(
     assert message in result.stderr
     assert "Traceback" not in result.stdout
     assert not (tmp_path / "out").exists()
+
+
+def test_relative_and_absolute_reflectance_are_not_mixed(
+    pictures: Path, tmp_path: Path
+) -> None:
+    db = skindb.open(str(tmp_path / "db"))
+    for name in ("relative", "absolute"):
+        folder = tmp_path / name
+        consent = {"scope": ["fit", "statistics"], "reference": "form"}
+        import_images(pictures, folder, {"subject": name, "consent": consent})
+        path = folder / "dome/dome.json"
+        dome = json.loads(path.read_text())
+        path.write_text(json.dumps(dome | {"relative": name == "relative"}))
+        skindb.workflow.ingest_take(db, folder, spacing_mm=8)
+        skindb.workflow.fit_take(db, name)
+    with pytest.raises(InputError, match="relative: all takes of a study"):
+        skindb.workflow.study(db, "correlations")
+    with pytest.raises(InputError, match="needs absolute reflectance"):
+        _require_one_scale(STUDIES["chromophores"], [db.record("model", "relative")])
+    # one subject is too few for correlations, but its scale is not the reason
+    with pytest.raises(InputError) as error:
+        skindb.workflow.study(db, "correlations", takes=["relative"])
+    assert "all takes of a study" not in str(error.value)
