@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
 
-from skindb.calibration._merge_kernels import OK
+from skindb.calibration._merge_kernels import SATURATED
 from skindb.calibration.irradiance import light_falloff
 from skindb.calibration.radiance import FrameMerger, read_view
 from skindb.errors import attempt_all, require
@@ -25,6 +25,7 @@ from skindb.types import Float64, Index, Mask
 # error of the normals for which their prior has no effect [degree]
 NO_SCAN_DEGREES = 60.0
 MAX_POINTS = 250_000  # of the grid; the equations of more take minutes
+POINTS_PER_BLOCK = 1 << 14  # whose directions to all lights are in memory: 60 MB
 MIN_LIGHTS = 3
 # of the brightest lights of a pixel; darker ones are in a shadow or graze the surface
 SHADOW_FRACTION = 0.08
@@ -138,7 +139,7 @@ def _grey_pictures(
 
     def picture(light: LightRecord) -> NDArray[np.float32]:
         radiance, flag = merger.merge(read_view(dome, light.id, camera))
-        radiance[(flag != OK) & ~np.isfinite(radiance).all(axis=-1)] = np.nan
+        radiance[flag == SATURATED] = np.nan
         grey = radiance.mean(axis=-1)[: rows * step, : columns * step]
         grey = grey.reshape(rows, step, columns, step).mean(axis=(1, 3))
         intensity = 1.0 if light.intensity is None else light.intensity.mean()
@@ -195,12 +196,29 @@ def photometric_normals(
         NaN where fewer than three lights are used, where these are in a plane, or where
         the normal faces away from the camera.
     """
-    shape = lit.shape[1:]
-    at = np.flatnonzero((lit.sum(axis=0) >= MIN_LIGHTS).ravel())
-    place = points.reshape(-1, 3)[at]
-    value = values.reshape(len(lights), -1)[:, at]
-    weight = lit.reshape(len(lights), -1)[:, at].astype(np.float64)
-    direction = np.empty((len(lights), len(at), 3))
+    normal = np.full((lit[0].size, 3), np.nan)
+    enough = np.flatnonzero((lit.sum(axis=0) >= MIN_LIGHTS).ravel())
+    for i in range(0, len(enough), POINTS_PER_BLOCK):
+        at = enough[i : i + POINTS_PER_BLOCK]
+        normal[at] = _normals_of(
+            values.reshape(len(lights), -1)[:, at].astype(np.float64),
+            lit.reshape(len(lights), -1)[:, at].astype(np.float64),
+            lights,
+            points.reshape(-1, 3)[at],
+            towards.reshape(-1, 3)[at],
+        )
+    return normal.reshape(*lit.shape[1:], 3)
+
+
+def _normals_of(
+    value: Float64,
+    weight: Float64,
+    lights: tuple[LightRecord, ...],
+    place: Float64,
+    view: Float64,
+) -> Float64:
+    """Normals (p, 3) from values (light, p) where the weights are 1."""
+    direction = np.empty((*value.shape, 3))
     for j, light in enumerate(lights):
         square, falloff = light_falloff(light, place)
         way = light.position - place
@@ -208,12 +226,12 @@ def photometric_normals(
         # so that value = direction . solution for a matt surface
         value[j] *= square / np.maximum(falloff, 1e-6)
     value = np.where(weight > 0, value, 0.0)
-    solution = np.zeros((len(at), 3))
+    solution = np.zeros(place.shape)
     used = weight
     for _ in range(ROUNDS):
         # einsum of three factors is slow
         weighted = used[..., None] * direction
-        system = np.einsum("jpa,jpb->pab", weighted, direction, optimize=True)
+        system = np.einsum("jpa,jpb->pab", weighted, direction)
         right = np.einsum("jpa,jp->pa", weighted, value)
         ridge = 1e-12 * np.trace(system, axis1=1, axis2=2)
         system += ridge[:, None, None] * np.eye(3)
@@ -226,13 +244,10 @@ def photometric_normals(
         np.einsum("jpa,jpb->pab", weight[..., None] * direction, direction)
     )
     length = np.linalg.norm(solution, axis=1)
-    normal = np.full((lit[0].size, 3), np.nan)
     unit = solution / np.maximum(length, 1e-300)[:, None]
-    view = towards.reshape(-1, 3)[at]
-    facing = np.einsum("pa,pa->p", unit, view) / np.linalg.norm(view, axis=1)
+    facing = np.einsum("pa,pa->p", unit, view)
     good = (spread[:, 0] > MIN_SPREAD * spread[:, 2]) & (facing > 0) & (length > 0)
-    normal[at[good]] = unit[good]
-    return normal.reshape(*shape, 3)
+    return np.where(good[:, None], unit, np.nan)
 
 
 def _integrated(normal: Float64, known: Mask, rays: Float64) -> Float64:
