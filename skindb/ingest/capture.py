@@ -63,7 +63,7 @@ from skindb.ingest.refinement import (
     reason_to_skip,
     refine_cameras,
 )
-from skindb.ingest.relief import NO_SCAN_DEGREES, Relief, estimate_relief
+from skindb.ingest.relief import MAX_POINTS, NO_SCAN_DEGREES, Relief, estimate_relief
 from skindb.ingest.report import (
     capture_provenance,
     describe_samples,
@@ -233,6 +233,11 @@ class _Run:
             notes.append(
                 f"the points of the scan are {spacing:.2g} mm apart; a wider spacing leaves "
                 "the scan unchanged"
+            )
+        if self.relief is not None and spacing > 1.5 * self.parameters.spacing_mm:
+            notes.append(
+                f"the surface that the photographs show has points {spacing:.2g} mm apart; "
+                f"it is limited to the pixels, and to {MAX_POINTS:,} points"
             )
         count = len(self.surfels.position)
         summary = self.summary | {

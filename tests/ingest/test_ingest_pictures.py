@@ -85,6 +85,9 @@ def test_a_surface_is_estimated_without_a_scan(pictures: Path, tmp_path: Path) -
     shift = np.median((z - depth)[inner])
     assert np.abs(z - depth - shift)[inner].max() < 1.5
     assert any("no prior" in line for line in tree.attrs["skipped"])
+    assert any(
+        "limited to the pixels" in note for note in tree.attrs["summary"]["notes"]
+    )
     assert any("relative" in line for line in tree.attrs["skipped"])
 
 
