@@ -476,7 +476,7 @@ def calibrated_dome(
             dome.lights, intensities, exponents, strict=True
         )
     )
-    return replace(dome, lights=tuple(calibrated))
+    return replace(dome, lights=tuple(calibrated), relative=False)
 
 
 def is_same_rig(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -152,6 +154,8 @@ def quick(source: Path, out: Path, **pictures: Any) -> None:
     The folder OUT gets maps, and a page to turn and light the subject in a browser.
     Nothing else is kept.
     """
+    # the folder with copies of the pictures is removed at the end
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     result = skindb.workflow.quick(source, out, progress=bar(), **pictures)
     for note in result["notes"]:
         echo(f"note: {note}", err=True)

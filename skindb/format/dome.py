@@ -213,11 +213,12 @@ def read_dome(
         fields.fault("relative", "must be true or false", shown(relative))
     if target is not None:
         white = _white(fields.object("white"), {c.id for c in cameras}, several)
-    elif not calibrated and unknown:
-        if len(unknown) < len(lights):
+    elif unknown:
+        if not calibrated and len(unknown) < len(lights):
             rule = "all lights need an intensity, or a white target, or none has one"
             finding = f"{len(unknown)} lights without intensity, first {unknown[0]}"
             fields.fault("white", rule, finding, "measure one of them")
+        # unless a calibration has intensities
         relative = True
     # version 1 keeps the sequence as an unchecked attribute
     sequence = None

@@ -8,7 +8,9 @@ import io
 import json
 import re
 import shutil
-from collections.abc import Mapping, Sequence
+import unicodedata
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
@@ -17,8 +19,9 @@ from typing import Any, Literal
 
 import imagecodecs
 import numpy as np
+import tifffile
 from numpy.typing import NDArray
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, ImageOps
 from scipy.spatial.transform import Rotation
 
 from skindb.calibration.lights import ball_outline, distant_light, highlight_centre
@@ -48,6 +51,7 @@ WHITE_REFLECTANCE = 0.5
 # of the radiances of linear files, which takes the place of the white level
 BRIGHT_QUANTILE = 0.999
 MAX_TABLE_BYTES = 4 << 20
+MASK = re.compile(r"(?<![a-z])mask(?![a-z])")
 COLUMNS = ("x", "y", "z")
 # of a file of lights; positions are in mm
 POSITION_COLUMNS = ("x_mm", "y_mm", "z_mm")
@@ -133,8 +137,15 @@ def import_images(
     source, out = Path(source), Path(out)
     _require_writable(out, person)
     files = _pictures(source)
-    masks = [file for file in files if "mask" in file.stem.lower()]
+    masks = [file for file in files if MASK.search(file.stem.lower())]
     files = [file for file in files if file not in masks]
+    require(
+        mask is not None or len(masks) < 2,
+        str(source),
+        "a folder must have at most one picture *mask*",
+        ", ".join(file.name for file in masks[:3]),
+        "name one with --mask",
+    )
     notes = []
     if mirror_ball is not None:
         table = _from_ball(Path(mirror_ball), files)
@@ -154,10 +165,11 @@ def import_images(
         notes.append(f"{unused} pictures have no light and are not used")
     ids = _ids([light.name for light in table])
     camera = _distant_camera(width, height, width_mm)
-    for k, (file, name) in enumerate(zip(chosen, ids, strict=True)):
-        frames.add(file, name, camera, inside)
-        progress("import", k + 1, len(chosen))
-    frames.finish(person, [camera], table, ids)
+    with _whole(out):
+        for k, (file, name) in enumerate(zip(chosen, ids, strict=True)):
+            frames.add(file, name, camera, inside)
+            progress("import", k + 1, len(chosen))
+        frames.finish(person, [camera], table, ids)
     return Imported(out, len(chosen), 1, (*notes, *frames.notes))
 
 
@@ -214,13 +226,39 @@ def import_olat(
     by_name = {str(device["id"]): device for device in devices}
     for device, name in zip(devices, camera_ids, strict=True):
         device["id"] = name
-    for k, ((light, camera), file) in enumerate(files.items()):
-        frames.add(file, light_ids[light], by_name[camera])
-        progress("import", k + 1, len(files))
     meshes = sorted([*source.glob("*.ply"), *source.glob("*.obj")])
-    frames.finish(person, devices, table, ids, Path(mesh) if mesh else _only(meshes))
+    scan = Path(mesh) if mesh else _only(meshes)
+    content = b"" if scan is None else read_regular(scan, MAX_SCAN_BYTES)
+    with _whole(out):
+        for k, ((light, camera), file) in enumerate(files.items()):
+            frames.add(file, light_ids[light], by_name[camera])
+            progress("import", k + 1, len(files))
+        suffix = "" if scan is None else scan.suffix.lower()
+        frames.finish(person, devices, table, ids, content, suffix)
     notes = (f"pictures are {pattern}{frames.first.suffix}", *frames.notes)
     return Imported(out, len(table), len(devices), notes)
+
+
+@contextmanager
+def _whole(out: Path) -> Iterator[None]:
+    """Context in which a folder is written, or nothing remains of it."""
+    existed = out.exists()
+    try:
+        yield
+    except BaseException:
+        shutil.rmtree(out, ignore_errors=True)
+        if existed:
+            out.mkdir()
+        raise
+
+
+def _white_level(bright: float) -> float:
+    """Power of four that is the white level of linear files whose bright pixels have this
+    radiance: 1 for 0.4 to 1.5. Steps keep takes of one rig comparable.
+    """
+    if not bright > 0:
+        return 1.0
+    return float(4.0 ** np.ceil(np.log(bright / 1.5) / np.log(4)))
 
 
 class _Frames:
@@ -288,13 +326,14 @@ class _Frames:
         cameras: list[dict[str, Any]],
         lights: Sequence[Light],
         ids: Sequence[str],
-        scan: Path | None = None,
+        scan: bytes = b"",
+        suffix: str = "",
     ) -> None:
-        """Write the other files, capture.json last; without the frames if they have
-        faults.
+        """Write the other files, capture.json last.
+
+        `scan` is the content of the file of a scan, if there is one.
         """
         if self.faults:
-            shutil.rmtree(self.out)
             raise InputError(self.faults)
         bits = 8 * self.dtype.itemsize
         for camera in cameras:
@@ -305,7 +344,11 @@ class _Frames:
             private_file(self.out / "dome/response.csv").write_text(
                 _srgb_table(2**bits)
             )
-        white = max(self.levels, default=1.0) or 1.0
+        white = _white_level(max(self.levels, default=1.0))
+        if white != 1:
+            self.notes.append(
+                f"radiance {white:g} is taken as white: takes with another one cannot be compared"
+            )
         dome = {
             "cameras": cameras,
             "lights": _light_records(lights, ids, white),
@@ -315,10 +358,9 @@ class _Frames:
         }
         time = datetime.fromtimestamp(self.newest, UTC)
         record = _record(person, time) | {"dome": "dome/dome.json"}
-        if scan is not None:
-            record["mesh"] = f"scan{scan.suffix.lower()}"
-            content = read_regular(scan, MAX_SCAN_BYTES)
-            private_file(self.out / record["mesh"]).write_bytes(content)
+        if suffix:
+            record["mesh"] = f"scan{suffix}"
+            private_file(self.out / record["mesh"]).write_bytes(scan)
         for name, value in (("dome/dome.json", dome), ("capture.json", record)):
             text = json.dumps(value, indent=1)
             private_file(self.out / name).write_text(text, encoding="utf-8")
@@ -339,7 +381,7 @@ def read_lights(path: Path) -> list[Light]:
     try:
         text = read_regular(path, MAX_TABLE_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise _table_fault(path, "must be UTF-8 text", "other bytes") from None
+        raise _table_fault(path, "must be UTF-8 text", "another encoding") from None
     faults = list[Fault]()
     found = list[Light]()
     header = list[str]()
@@ -377,44 +419,65 @@ def read_picture(path: Path) -> Picture:
     InputError
         If it is not a whole picture of a known format.
     """
-    suffix = path.suffix.lower()
-    if suffix == ".exr":
+    if path.suffix.lower() == ".exr":
         return read_frame(path)
     content = read_regular(path, MAX_FRAME_BYTES)
     try:
-        if suffix == ".png":
+        # by its content, as names may be wrong
+        if content.startswith(b"\x89PNG"):
             picture = np.asarray(imagecodecs.png_decode(content))
-        elif suffix in (".tif", ".tiff"):
-            picture = np.asarray(imagecodecs.tiff_decode(content))
-        elif suffix in SUFFIXES:
-            with Image.open(io.BytesIO(content)) as image:
-                if image.width * image.height > MAX_FRAME_PIXELS:
-                    raise ValueError(f"{image.width} x {image.height} pixels")
-                turned = ImageOps.exif_transpose(image)
-                picture = np.asarray(turned.convert("RGB"))
+        elif content[:4] in (b"II*\0", b"MM\0*"):
+            picture = _tiff(content)
         else:
-            raise ValueError(f"a file {path.suffix}")
-    except (ValueError, RuntimeError, OSError, UnidentifiedImageError) as error:
+            with Image.open(
+                io.BytesIO(content), formats=("JPEG", "BMP")
+            ) as image:
+                picture = np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
+        if picture.ndim == 2:
+            picture = picture[..., None]
+        height, width, _ = picture.shape
+        if height * width > MAX_FRAME_PIXELS:
+            raise ValueError(
+                f"{width} x {height} pixels, more than {MAX_FRAME_PIXELS:,}"
+            )
+        if picture.dtype not in (np.uint8, np.uint16):
+            raise ValueError(f"values of {picture.dtype}, not of 8 or 16 bits")
+    except (ValueError, RuntimeError, OSError, Image.DecompressionBombError) as error:
         rule = f"a picture must be a whole {FORMATS} file"
-        cure = "export it again; raw and HEIC files have to be converted to TIFF"
+        cure = "export it as PNG, JPEG or plain TIFF; raw and HEIC files have to be converted"
         raise input_error(str(path), rule, short(str(error)), cure) from None
-    if picture.ndim == 2:
-        picture = picture[..., None]
-    if picture.ndim != 3 or picture.dtype not in (np.uint8, np.uint16):
-        rule = "a picture must have 8 or 16 bits per channel"
-        finding = f"{picture.dtype} of {' x '.join(map(str, picture.shape))}"
-        raise input_error(str(path), rule, finding, "export it as PNG or TIFF")
     if picture.shape[2] < 3:
         picture = np.repeat(picture[..., :1], 3, axis=2)
     return np.array(picture[..., :3])
 
 
+def _tiff(content: bytes) -> Picture:
+    """The only page of a TIFF; `ValueError` for what would be read wrongly."""
+    with tifffile.TiffFile(io.BytesIO(content)) as file:
+        page = file.pages[0]
+        orientation = page.tags.get("Orientation")
+        wrong = {
+            "several pages": len(file.pages) > 1,
+            "a palette or inverted values": page.photometric
+            not in (tifffile.PHOTOMETRIC.RGB, tifffile.PHOTOMETRIC.MINISBLACK),
+            "separate planes": page.ndim > 2 and page.planarconfig != 1,
+            "a turned picture": orientation is not None and orientation.value != 1,
+        }
+        if found := [what for what, is_so in wrong.items() if is_so]:
+            raise ValueError(", ".join(found))
+        return np.asarray(page.asarray())
+
+
 def _words(line: str) -> list[str]:
     """Cells of a line of a table; a name in front may contain spaces."""
     line = line.split("#", 1)[0].strip()
-    for separator in (";", ",", "\t"):
+    for separator in (";", "\t", ","):
         if separator in line:
-            return [cell.strip().strip('"') for cell in line.split(separator)]
+            cells = [cell.strip().strip('"') for cell in line.split(separator)]
+            if separator == ",":
+                return cells
+            # numbers with decimal commas
+            return [cells[0], *(cell.replace(",", ".") for cell in cells[1:])]
     words = line.split()
     front = len(words)
     while front > 1 and _numbers(words[front - 1 : front])[0] is not None:
@@ -436,7 +499,15 @@ def _numbers(words: Sequence[str]) -> list[float | None]:
 
 def _table_light(words: Sequence[str], header: Sequence[str], place: str) -> Light:
     """The light of a line."""
-    cells = dict(zip(header or ("picture", *COLUMNS), words, strict=False))
+    columns = header or ("picture", *COLUMNS)
+    require(
+        not any(words[len(columns) :]),
+        place,
+        f"must have {len(columns)} cells: {', '.join(columns)}",
+        short(", ".join(words)),
+        "name further columns in a header; write decimal points, or separate by semicolons",
+    )
+    cells = dict(zip(columns, words, strict=False))
     name = re.split(r"[\\/]", words[0])[-1]
     distant = not set(POSITION_COLUMNS) <= set(cells)
     values = _numbers(
@@ -507,17 +578,21 @@ def _natural(path: Path) -> list[tuple[int, int, str]]:
 
 def _matched(source: Path, files: Sequence[Path], table: Sequence[Light]) -> list[Path]:
     """The pictures of the lights, by name or without its suffix."""
-    by_name = {file.name.lower(): file for file in files}
-    by_stem = {file.stem.lower(): file for file in files}
-    faults = []
-    pairs = []
+    by_name = {_folded(file.name): file for file in files}
+    by_stem = {_folded(file.stem): file for file in files}
+    faults = list[Fault]()
+    pairs = list[Path]()
     for light in table:
-        name = light.name.lower()
+        name = _folded(light.name)
         file = by_name.get(name) or by_stem.get(name) or by_stem.get(Path(name).stem)
         if file is None:
             rule = "every light of the table must have a picture"
             cure = "correct the name, or remove the line"
             faults.append(Fault(str(source), rule, f"no {short(light.name)}", cure))
+        elif file in pairs:
+            rule = "a picture must have one light"
+            cure = "name pictures with their suffixes, and each in one line"
+            faults.append(Fault(str(source), rule, f"{short(file.name)} twice", cure))
         else:
             pairs.append(file)
     if faults:
@@ -532,10 +607,15 @@ def _matched(source: Path, files: Sequence[Path], table: Sequence[Light]) -> lis
     return pairs
 
 
+def _folded(name: str) -> str:
+    """A name without differences that file systems make."""
+    return unicodedata.normalize("NFC", name).lower()
+
+
 def _from_ball(folder: Path, files: Sequence[Path]) -> list[Light]:
     """Directions of the lights of `files`, from pictures of a mirror ball."""
     balls = _pictures(folder)
-    masks = [file for file in balls if "mask" in file.stem.lower()]
+    masks = [file for file in balls if MASK.search(file.stem.lower())]
     balls = [file for file in balls if file not in masks]
     require(
         len(masks) == 1 and len(balls) == len(files),
@@ -565,6 +645,13 @@ def _mask(path: Path | None, size: tuple[int, int]) -> Mask:
     if path is None:
         return np.ones(size, bool)
     inside = _bright(path)
+    require(
+        bool(inside.any()),
+        str(path),
+        "a mask must be bright on the subject",
+        "no bright pixel",
+        "draw it again",
+    )
     require(
         inside.shape == size,
         str(path),
@@ -608,6 +695,7 @@ def _light_records(
     near = [float(np.linalg.norm(x.vector)) for x in lights if not x.distant]
     square = float(np.median(near)) ** 2 if near else 1.0
     irradiance = np.pi * white / WHITE_REFLECTANCE
+    usual = float(np.median([light.gain for light in lights]))
     records = []
     for light, name in zip(lights, ids, strict=True):
         key = "direction" if light.distant else "position"
@@ -616,7 +704,7 @@ def _light_records(
             {
                 "id": name,
                 key: light.vector.tolist(),
-                "intensity": [irradiance * factor * light.gain] * 3,
+                "intensity": [irradiance * factor * light.gain / usual] * 3,
             }
         )
     return records
@@ -648,8 +736,14 @@ def _read_cameras(source: Path, given: Path | None) -> list[dict[str, Any]]:
     fields = Fields(
         {"cameras": data} if isinstance(data, list) else data, str(path), faults
     )
-    if not faults:
-        fields.items("cameras", maximum=MAX_CAMERAS)
+    items = [] if faults else fields.items("cameras", maximum=MAX_CAMERAS)
+    for item in items:
+        item.text("id")
+        for key, shape in (("K", (3, 3)), ("R", (3, 3)), ("t", (3,))):
+            item.array(key, shape)
+        for key in ("width", "height"):
+            if item.has(key):
+                item.integer(key, minimum=1)
     if faults:
         raise InputError(faults)
     keys = ("id", "width", "height", "K", "R", "t", "distortion")
@@ -669,36 +763,40 @@ def _colmap_cameras(folder: Path) -> list[dict[str, Any]]:
         "neither",
         "export the model of COLMAP as text, or write cameras.json",
     )
-    lines = {
-        name: [
-            line.split()
-            for line in read_regular(path, MAX_TABLE_BYTES * 16).decode().splitlines()
-            if not line.startswith("#")
-        ]
-        for name, path in tables.items()
-    }
     place = str(tables["cameras"])
     lenses = {}
-    found = []
+    found = list[dict[str, Any]]()
     try:
+        lines = {
+            name: [
+                line.split()
+                for line in read_regular(path, MAX_SCAN_BYTES).decode().splitlines()
+                if not line.startswith("#")
+            ]
+            for name, path in tables.items()
+        }
         for number, model, width, height, *values in filter(None, lines["cameras"]):
             lens = _colmap_lens(model, [float(value) for value in values], place)
             lenses[number] = {"width": int(width), "height": int(height), **lens}
         place = str(tables["images"])
-        # every second line lists points
-        for words in lines["images"][::2]:
+        rows = iter(lines["images"])
+        for words in rows:
+            if not words:
+                continue
             _, *pose, number, name = words
             w, x, y, z, *t = map(float, pose)
-            found.append(
-                {
-                    "id": Path(name).parts[0] if "/" in name else Path(name).stem,
-                    **lenses[number],
-                    "R": Rotation.from_quat([x, y, z, w]).as_matrix().tolist(),
-                    "t": t,
-                }
-            )
+            # of points, x y id; empty without any
+            if len(points := next(rows, [])) % 3 or None in _numbers(points):
+                raise ValueError("an image must be followed by a line of its points")
+            camera = Path(name).parts[0] if "/" in name else Path(name).stem
+            if camera in [record["id"] for record in found]:
+                raise ValueError(f"two images of camera {camera}")
+            rotation = Rotation.from_quat([x, y, z, w]).as_matrix().tolist()
+            found.append({"id": camera, **lenses[number], "R": rotation, "t": t})
+    except InputError:
+        raise
     except (ValueError, KeyError) as error:
-        rule = "must be a text model of COLMAP"
+        rule = "must be a text model of COLMAP, with one image for each camera"
         cure = "export the model as text again"
         raise input_error(place, rule, short(str(error)), cure) from None
     return found
@@ -723,21 +821,28 @@ def _colmap_lens(model: str, v: Sequence[float], place: str) -> dict[str, Any]:
     )
 
 
+def _is_file(name: str) -> bool:
+    return Path(name).suffix.lower() in SUFFIXES
+
+
 def _olat_files(
     source: Path, lights: Sequence[str], cameras: Sequence[str]
 ) -> tuple[str, dict[tuple[str, str], Path]]:
     """The pattern of the pictures, and the picture of every light and camera."""
+    by_name = {
+        _folded(file.relative_to(source).with_suffix("").as_posix()): file
+        for file in [*source.glob("*"), *source.glob("*/*")]
+        if file.suffix.lower() in SUFFIXES
+    }
     best: tuple[int, str, dict[tuple[str, str], Path]] = (-1, "", {})
     for pattern in PATTERNS:
         files = {}
         for light in lights:
+            name = light.removesuffix(Path(light).suffix) if _is_file(light) else light
             for camera in cameras:
-                stem = pattern.format(light=Path(light).stem, camera=camera)
-                for suffix in SUFFIXES:
-                    path = source / f"{stem}{suffix}"
-                    if path.is_file():
-                        files[light, camera] = path
-                        break
+                stem = _folded(pattern.format(light=name, camera=camera))
+                if file := by_name.get(stem):
+                    files[light, camera] = file
         if len(files) > best[0]:
             best = (len(files), pattern, files)
     count, pattern, files = best

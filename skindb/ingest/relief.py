@@ -121,6 +121,13 @@ def estimate_relief(
     vertices = (camera.centre + depth[..., None] * rays).reshape(-1, 3)
     width = step * camera.pixel_width(np.zeros(3))
     faces = _faces(known, depth, width)
+    require(
+        len(faces) > 0,
+        f"{dome.file}[frames]",
+        "neighbouring pixels must be lit by three lights to form a surface",
+        f"{known.sum():,} pixels without such neighbours",
+        "photograph the subject larger, or with more lights",
+    )
     return Relief(Scan(vertices, faces), clean_mesh(vertices, faces), lit, step)
 
 
@@ -238,7 +245,9 @@ def _normals_of(
         solution = np.linalg.solve(system, right[..., None])[..., 0]
         residual = np.abs(np.einsum("jpa,pa->jp", direction, solution) - value)
         scale = np.nanmedian(np.where(weight > 0, residual, np.nan), axis=0) / 0.6745
-        ratio = residual / (CAUCHY * np.maximum(scale, 1e-9 * np.abs(value).max()))
+        ratio = residual / (
+            CAUCHY * np.maximum(scale, 1e-9 * np.abs(value).max(initial=0))
+        )
         used = weight / (1 + ratio**2)
     spread = np.linalg.eigvalsh(
         np.einsum("jpa,jpb->pab", weight[..., None] * direction, direction)

@@ -317,6 +317,8 @@ class Mixture:
     ) -> tuple[Mixture, Array, tuple[Omission, ...]]:
         """The mixture without the tables whose weight is zero at all surfels."""
         positive = (parameters != 0).any(axis=0)
+        if not positive.any():
+            positive[:1] = True  # a mixture has a table
         if positive.all():
             return self, parameters, ()
         names = tuple(np.array(self.names)[positive])

@@ -65,9 +65,13 @@ def surfel_texels(fitted: xr.Dataset) -> Codes:
     return code
 
 
-def surfel_confidence(fitted: xr.Dataset) -> NDArray[np.float32]:
-    """(n,) 1 for fitted surfels, 0.5 for doubtful fits, 0 for all others."""
+def surfel_confidence(fitted: xr.Dataset, *, matt: bool = False) -> NDArray[np.float32]:
+    """(n,) 1 for fitted surfels, 0.5 for doubtful fits and, if they are wanted, `matt`
+    ones without a surface, 0 for all others.
+    """
     trust: NDArray[np.float32] = TRUST[surfel_texels(fitted)]
+    if matt:
+        trust[fitted[variables.FIT_STATUS].values == FitStatus.LAMBERT] = 0.5
     if not trust.any():
         rule = "at least one surfel must be fitted for an export"
         raise InputError(

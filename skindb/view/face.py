@@ -388,7 +388,8 @@ def _quality(model: xr.DataTree, surface: Surface) -> Float:
             ).mean(axis=1)
             break
     return np.stack(
-        [surfel_confidence(fitted), np.clip(np.nan_to_num(error), 0, 10)], axis=1
+        [surfel_confidence(fitted, matt=True), np.clip(np.nan_to_num(error), 0, 10)],
+        axis=1,
     )
 
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import unicodedata
 from pathlib import Path
 
+import imagecodecs
 import numpy as np
 import pytest
+import tifffile
 from PIL import Image
 from planted_pictures import (
     ALBEDO,
@@ -212,6 +215,7 @@ def test_a_mask_and_grey_pictures(pictures: Path, tmp_path: Path) -> None:
     [
         ("a.png 1 0 1\nb.png 0 1 1\n", 2),
         ("2\nmy file.png 1 0 1\nC:\\x\\b.png 0 1 1\n", 2),
+        ("a.png;1,0;0,0;1,0\nb.png;0;1;1\n", 2),
         ("# comment\nname;x;y;z;intensity\na.png;1;0;1;2\nb.png;0;1;1;1\n", 2),
     ],
 )
@@ -233,6 +237,8 @@ def test_tables_of_lights(tmp_path: Path, text: str, lights: int) -> None:
         ("picture,x,y,z\na.png,1,zero,1\n", "line 2"),
         ("a.png,x,y,z,intensity\nb.png,1,0,1,-1\n", "line 2"),
         ("", "0 lights"),
+        ("a.png,-0,7,0,1,0,7\n", "decimal points"),
+        ("picture,x,y,z\na.png,1,0,1,2\n", "4 cells"),
     ],
 )
 def test_faulty_tables_are_refused(tmp_path: Path, text: str, words: str) -> None:
@@ -240,6 +246,116 @@ def test_faulty_tables_are_refused(tmp_path: Path, text: str, words: str) -> Non
     path.write_text(text)
     with pytest.raises(InputError, match=words):
         read_lights(path)
+
+
+def test_formats_that_would_be_read_wrongly(tmp_path: Path) -> None:
+    values = np.arange(24, dtype=np.uint16).reshape(4, 6)
+    grey = tmp_path / "grey.jpg"  # a PNG
+    grey.write_bytes(imagecodecs.png_encode(values * 1000))
+    assert np.array_equal(read_picture(grey)[..., 0], values * 1000)
+    colour = np.repeat(values[..., None], 3, axis=2)
+    plain = tmp_path / "plain.tif"
+    tifffile.imwrite(plain, colour, photometric="rgb")
+    assert np.array_equal(read_picture(plain), colour)
+    options = {
+        "planes": {"photometric": "rgb", "planarconfig": "separate"},
+        "inverted": {"photometric": "miniswhite"},
+        "turned": {"photometric": "rgb", "extratags": [(274, "H", 1, 6, True)]},
+        "float": {"photometric": "rgb"},
+    }
+    for name, option in options.items():
+        picture = {
+            "planes": np.moveaxis(colour, 2, 0),
+            "inverted": values,
+            "float": colour.astype(np.float32),
+        }.get(name, colour)
+        path = tmp_path / f"{name}.tif"
+        tifffile.imwrite(path, picture, **option)
+        with pytest.raises(InputError, match="plain TIFF"):
+            read_picture(path)
+
+
+def test_masks_and_repeated_pictures_are_not_guessed(
+    pictures: Path, tmp_path: Path
+) -> None:
+    white = np.full((SIZE, SIZE, 3), 255, np.uint8)
+    write_frame(pictures / "mask.png", 0 * white)
+    with pytest.raises(InputError, match="no bright pixel"):
+        import_images(pictures, tmp_path / "capture", PERSON)
+    write_frame(pictures / "other mask.png", white)
+    with pytest.raises(InputError, match="at most one picture"):
+        import_images(pictures, tmp_path / "capture", PERSON)
+    table = pictures / "lights.csv"
+    table.write_text(table.read_text() + "picture 1,0,0,1\n")
+    with pytest.raises(InputError, match="twice"):
+        import_images(
+            pictures, tmp_path / "capture", PERSON, mask=pictures / "other mask.png"
+        )
+
+
+def test_composed_and_decomposed_names_are_the_same(tmp_path: Path) -> None:
+    folder = tmp_path / "pictures"
+    names = write_pictures(folder, LIGHTS)
+    for name in names:
+        (folder / name).rename(folder / unicodedata.normalize("NFD", f"ü{name}"))
+    table = [unicodedata.normalize("NFC", f"Ü{name}") for name in names]
+    write_table(folder / "lights.csv", table, LIGHTS)
+    assert import_images(folder, tmp_path / "capture", PERSON).lights == 9
+
+
+@pytest.mark.parametrize(
+    ("scale", "white"), [(0.3, 1), (0.9, 1), (0.02, 4**-2), (30, 64)]
+)
+def test_linear_pictures_keep_their_scale(
+    tmp_path: Path, scale: float, white: float
+) -> None:
+    """Two subjects of one rig are not made equally bright."""
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    names = [f"{k}.exr" for k in range(len(LIGHTS))]
+    for name, light in zip(names, LIGHTS, strict=True):
+        write_frame(folder / name, (2 * scale * radiance(light)).astype(np.float32))
+    write_table(folder / "lights.csv", names, LIGHTS)
+    result = import_images(folder, tmp_path / "capture", PERSON)
+    dome = json.loads((tmp_path / "capture/dome/dome.json").read_text())
+    assert dome["lights"][0]["intensity"][0] == pytest.approx(2 * np.pi * white)
+    assert any("taken as white" in note for note in result.notes) == (white != 1)
+
+
+def test_relative_intensities_have_any_unit(pictures: Path, tmp_path: Path) -> None:
+    table = pictures / "lights.csv"
+    lines = table.read_text().splitlines()
+    rows = [f"{line},{1000 + k}" for k, line in enumerate(lines[1:])]
+    table.write_text("\n".join([f"{lines[0]},intensity", *rows]))
+    import_images(pictures, tmp_path / "capture", PERSON)
+    dome = json.loads((tmp_path / "capture/dome/dome.json").read_text())
+    values = [light["intensity"][0] for light in dome["lights"]]
+    assert values[4] == pytest.approx(2 * np.pi)
+    assert values[8] / values[0] == pytest.approx(1008 / 1000)
+
+
+def test_black_pictures_are_one_line(tmp_path: Path) -> None:
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    names = [f"{k}.png" for k in range(len(LIGHTS))]
+    for name in names:
+        write_frame(folder / name, np.zeros((SIZE, SIZE, 3), np.uint8))
+    write_table(folder / "lights.csv", names, LIGHTS)
+    import_images(folder, tmp_path / "capture", PERSON)
+    with pytest.raises(InputError):
+        ingested(tmp_path / "capture", tmp_path)
+
+
+def test_an_import_that_stops_leaves_nothing(pictures: Path, tmp_path: Path) -> None:
+    def stop(_: str, done: int, __: int) -> None:
+        if done == 3:
+            raise KeyboardInterrupt
+
+    out = tmp_path / "capture"
+    out.mkdir()
+    with pytest.raises(KeyboardInterrupt):
+        import_images(pictures, out, PERSON, progress=stop)
+    assert not any(out.iterdir())
 
 
 def test_every_faulty_picture_is_named_and_nothing_is_left(
@@ -317,6 +433,27 @@ def test_a_light_stage(tmp_path: Path) -> None:
     inner = truth[:, 2] > 0.5
     miss = angle(tree["surfels"]["surfel_normal"].values, truth)[inner]
     assert np.median(miss) < 3
+    images = source / "images.txt"
+    text = images.read_text()
+    for wrong, words in (
+        (text + text.splitlines()[1] + "\n\n", "two images of camera"),
+        (text.replace("\n1 2 3\n", "\n2 0 1 0 0 0 0 10000 1 back.png\n"), "its points"),
+        (text.replace("1 0 1 0", "1 0 one 0"), "text model"),
+    ):
+        images.write_text(wrong)
+        with pytest.raises(InputError, match=words):
+            import_olat(source, tmp_path / "again", PERSON)
+    images.write_text(text)
+    record = {"id": 1, "K": "hello", "R": [], "t": [0, 0, 1], "width": "48"}
+    (source / "cameras.json").write_text(json.dumps([record]))
+    with pytest.raises(InputError) as error:
+        import_olat(source, tmp_path / "again", PERSON)
+    assert len(error.value.faults) == 4
+    (source / "cameras.json").unlink()
+    write_frame(source / "L3_front.PNG", np.zeros((3, 4, 3), np.uint16))
+    (source / "L3_front.png").unlink()
+    with pytest.raises(InputError, match="48 x 48"):
+        import_olat(source, tmp_path / "again", PERSON)
     (source / "L4_front.png").unlink()
     with pytest.raises(InputError, match="none of light L4, camera front"):
         import_olat(source, tmp_path / "again", PERSON)

@@ -69,6 +69,15 @@ def test_quick_writes_maps_and_a_page(pictures: Path, tmp_path: Path) -> None:
     assert "results are not replaced" in again.stderr
 
 
+def test_three_lights_are_enough(tmp_path: Path) -> None:
+    lights = directions(4)[1:]
+    folder = tmp_path / "three"
+    write_table(folder / "lights.csv", write_pictures(folder, lights), lights)
+    result = run("quick", folder, tmp_path / "out", "--no-progress")
+    assert result.returncode == 0, result.stderr
+    assert "lambert 100.0%" in result.stdout
+
+
 def test_import_then_ingest_and_fit(pictures: Path, tmp_path: Path) -> None:
     capture = tmp_path / "capture"
     person = ["--subject", "3", "--consent", "fit", "--reference", "form 1"]
