@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from skindb.calibration.lights import ball_outline, distant_light, highlight_centre
 from skindb.errors import Fault, InputError, attempt, input_error, require
-from skindb.files import private_file, private_umask, read_regular
+from skindb.files import make_private, private_file, read_regular
 from skindb.format.fields import IDENTIFIER, Fields, read_json, short
 from skindb.format.folder import FORMAT, record_faults
 from skindb.format.frames import read_frame, write_frame
@@ -248,7 +248,7 @@ def _whole(out: Path) -> Iterator[None]:
     except BaseException:
         shutil.rmtree(out, ignore_errors=True)
         if existed:
-            out.mkdir()
+            make_private(out)
         raise
 
 
@@ -315,8 +315,7 @@ class _Frames:
             used = picture if inside is None else picture[inside]
             self.levels.append(float(np.quantile(used, BRIGHT_QUANTILE)))
         target = self.out / f"dome/frames/{light}_{camera['id']}{self.suffix}"
-        with private_umask():
-            target.parent.mkdir(parents=True, exist_ok=True)
+        make_private(target.parent)
         write_frame(target, picture)
         self.newest = max(self.newest, file.stat().st_mtime)
 
@@ -429,9 +428,7 @@ def read_picture(path: Path) -> Picture:
         elif content[:4] in (b"II*\0", b"MM\0*"):
             picture = _tiff(content)
         else:
-            with Image.open(
-                io.BytesIO(content), formats=("JPEG", "BMP")
-            ) as image:
+            with Image.open(io.BytesIO(content), formats=("JPEG", "BMP")) as image:
                 picture = np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
         if picture.ndim == 2:
             picture = picture[..., None]

@@ -42,7 +42,7 @@ from .pictures import (
     view_server,
     view_takes,
 )
-from .quick import quick
+from .quicklook import quick
 from .rig import calibrate_rig, describe_rig
 from .session import capture_session, plan_session
 from .simulation import begin_cohort, simulate, simulate_one

@@ -274,10 +274,6 @@ FAULTS = {
         put(D, "frames", value="{light.x}{camera}{exposure}"),
         r"\[frames\]: must name",
     ),
-    "neither intensity nor white": (
-        put(D, "white", value=None),
-        r"\[white\]: lights need",
-    ),
     "white of a stranger": (
         put(D, "white", "cameras", value=["c7"]),
         r"\[white\]\[cameras\]: .*found c7",
@@ -502,6 +498,14 @@ def test_read_capture__names_the_fault_with_file_and_key(capture_folder, name):
     spoil, message = FAULTS[name]
     spoil(capture_folder)
     with pytest.raises(InputError, match=message):
+        read_capture(capture_folder)
+
+
+def test_read_capture__intensities_of_all_lights_or_of_none(capture_folder):
+    put(D, "white", value=None)(capture_folder)
+    assert read_capture(capture_folder).dome.relative
+    put(D, "lights", 0, "intensity", value=[1, 1, 1])(capture_folder)
+    with pytest.raises(InputError, match="all lights need an intensity"):
         read_capture(capture_folder)
 
 

@@ -50,6 +50,7 @@ ABSENT = (
     "light_polarisation",
     "camera_polarisation",
     "relative_reflectance",
+    "light_gain_applied",
 )
 
 

@@ -25,6 +25,7 @@ pytestmark = pytest.mark.slow
 LOG_THEMSELVES = {
     "backup",
     "calibrate",
+    "calibrate_rig",
     "clean",
     "create_release",
     "ingest_take",
@@ -36,6 +37,7 @@ LOG_THEMSELVES = {
 # data of subjects
 NOT_LOGGED = {
     "describe_calibration",
+    "describe_rig",
     "kept_parameters",
     "parameters_of",
     "plan_withdrawal",
