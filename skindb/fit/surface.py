@@ -61,11 +61,11 @@ def fit_surface(
         Surface model, such as `Mixture.of_dictionary`: mixtures of all BRDFs of a
         dictionary.
     mode
-        "linear": min |M x - R|. "perceptual": min |root(M x) - root(R)| with root(y) =
-        y / (y^2 + floor^2)^(1/3), the signed cube root that is linear below the noise
-        floor, by Gauss-Newton with a line search; then one linear step weighted with
-        the squared slopes of the root, which is not biased by noise as the cube root
-        is.
+        "linear": the least norm of M x - R. "perceptual": that of root(M x) - root(R),
+        with root(y) = y / (y^2 + floor^2)^(1/3), the signed cube root that is linear
+        below the noise floor, by Gauss-Newton with a line search; then one linear step
+        weighted with the squared slopes of the root, which is not biased by noise as
+        the cube root is.
     eta
         Refractive index of the diffuse term that is subtracted.
     min_width
