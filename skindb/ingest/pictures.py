@@ -467,7 +467,7 @@ def _tiff(content: bytes) -> Picture:
 
 def _words(line: str) -> list[str]:
     """Cells of a line of a table; a name in front may contain spaces."""
-    line = line.split("#", 1)[0].strip()
+    line = re.sub(r"(^|\s)#.*", "", line).strip()  # names may contain the sign
     for separator in (";", "\t", ","):
         if separator in line:
             cells = [cell.strip().strip('"') for cell in line.split(separator)]

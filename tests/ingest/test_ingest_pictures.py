@@ -216,6 +216,7 @@ def test_a_mask_and_grey_pictures(pictures: Path, tmp_path: Path) -> None:
         ("a.png 1 0 1\nb.png 0 1 1\n", 2),
         ("2\nmy file.png 1 0 1\nC:\\x\\b.png 0 1 1\n", 2),
         ("a.png;1,0;0,0;1,0\nb.png;0;1;1\n", 2),
+        ("a#1.png 1 0 1 # left\nb.png 0 1 1\n", 2),
         ("# comment\nname;x;y;z;intensity\na.png;1;0;1;2\nb.png;0;1;1;1\n", 2),
     ],
 )
