@@ -114,6 +114,8 @@ def main(data: Path, out: Path) -> None:
         known = sphere if name == "gray" else None
         row = report(f"UW-{name}", photometric / "uw" / name, out, ball, known)
         print(row, flush=True)
+    matt = ball | {"eta": 1.0}
+    print(report("UW-gray-matt", photometric / "uw/gray", out, matt, sphere))
     for path in sorted((photometric / "yale").glob("*.npz")):
         yale(path, out / path.stem)
         print(report(path.stem, out / path.stem, out, {}), flush=True)

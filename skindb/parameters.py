@@ -51,6 +51,7 @@ SURFACE_ENERGY = {
 SURFACE_ENERGY_ELSEWHERE = (0.040, 0.015)
 # RMS angle of the normals of a scan that does not state it
 SCAN_ERROR_DEGREES = 3.0
+MAX_WIDTH_MM = 100_000.0  # of a picture on the subject: a wall
 VIRTUAL_SEED = 2005
 VIRTUAL_EXPOSURES = 2  # of every view of the virtual dome
 CONDITIONS = ("normal", "lotion", "powder", "sweat", "hot", "cold", "makeup", "tan")
@@ -337,6 +338,101 @@ class IngestParameters(Limited):
     refine: bool | Literal["auto"] = option(
         "auto",
         "Correct the orientation of each camera so that its photographs match the scan.",
+    )
+
+
+@dataclass(frozen=True)
+class PictureParameters(Limited):
+    """What is known about pictures of one camera, each under one light.
+
+    Parameters
+    ----------
+    lights
+        Table of the lights (CSV or RTI .lp): a line for each picture with its file name
+        and the direction to the light, x to the right of the picture, y up, z to the
+        camera; or columns x_mm, y_mm, z_mm of positions. Of a light stage it is in the
+        frame of the cameras, and names are those in the pictures.
+    mirror_ball
+        Folder of pictures of a mirror ball under the same lights, in the same order, and
+        one picture `*mask*` of its disc; instead of `lights`.
+    mask
+        Picture that is bright on the subject.
+    response
+        "srgb" or "linear" values, or a file with the response of the camera (CSV
+        dn,r,g,b, see docs/capture_format.md); "auto" takes pictures of 8 bits as sRGB.
+    width_mm
+        Width of the picture on the subject.
+    """
+
+    lights: Path | None = option(
+        None,
+        "Table of the lights (.csv or RTI .lp): picture, x, y, z of the direction to "
+        "the light; x to the right, y up, z to the camera. Columns x_mm, y_mm, z_mm "
+        "are positions.  [default: lights.csv or the .lp file in SOURCE]",
+    )
+    mirror_ball: Path | None = option(
+        None,
+        "Folder of pictures of a mirror ball under the same lights, and of its mask.",
+    )
+    mask: Path | None = option(
+        None,
+        "Picture that is bright on the subject.  [default: *mask* in SOURCE]",
+    )
+    response: str = option(
+        "auto",
+        "Values of the pictures: srgb, linear, or a file with the response of the "
+        "camera (dn,r,g,b); auto: 8 bits are sRGB, others are linear.",
+    )
+    width_mm: float | None = option(
+        None,
+        "Width of a picture on the subject in mm.  [default: 250 on the longer side]",
+        name="width",
+        minimum=0,
+        maximum=MAX_WIDTH_MM,
+        above_minimum=True,
+    )
+
+
+@dataclass(frozen=True)
+class QuickParameters(PictureParameters):
+    """What is known about pictures of one camera, and about the subject.
+
+    Parameters
+    ----------
+    eta
+        Refractive index of the subject.
+    """
+
+    eta: float = option(
+        1.3,
+        "Refractive index of the subject: 1.3 of skin; 1 of matt things without a smooth "
+        "boundary, such as plaster or paper.",
+        minimum=1.0,
+        maximum=2.0,
+    )
+
+
+@dataclass(frozen=True)
+class ImportParameters(PictureParameters):
+    """What is known about pictures of one camera, or of a light stage.
+
+    Parameters
+    ----------
+    cameras
+        JSON with a list of `id, K, R, t` and optional `width, height, distortion`, as in
+        dome.json, or a folder with cameras.txt and images.txt of COLMAP, whose images
+        are named after the cameras.
+    scan
+        Scan in mm, PLY or OBJ. One camera needs none.
+    """
+
+    cameras: Path | None = option(
+        None,
+        "Cameras of olat: a JSON file, or a folder with a text model of COLMAP.  "
+        "[default: cameras.json or SOURCE]",
+    )
+    scan: Path | None = option(
+        None, "Triangle mesh of olat in mm.  [default: that in SOURCE]"
     )
 
 

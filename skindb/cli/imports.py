@@ -4,59 +4,19 @@ from __future__ import annotations
 
 import signal
 import sys
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import click
 
 import skindb
-from skindb.cli.options import PATH, Finite, common
+from skindb.cli.options import PATH, common, options_of
 from skindb.cli.shared import emit
 from skindb.cli.terminal import bar, echo
-from skindb.errors import input_error
+from skindb.parameters import ImportParameters, QuickParameters
 
 SOURCE = click.argument("source", type=PATH)
 OUT = click.argument("out", type=PATH)
-MAX_WIDTH_MM = 100_000.0  # of a picture on the subject: a wall
-PICTURES = (
-    click.option(
-        "--lights",
-        type=PATH,
-        help=(
-            "Table of the lights (.csv or RTI .lp): picture, x, y, z of the direction to "
-            "the light; x to the right, y up, z to the camera. Columns x_mm, y_mm, z_mm "
-            "are positions.  [default: lights.csv or the .lp file in SOURCE]"
-        ),
-    ),
-    click.option(
-        "--mirror-ball",
-        type=PATH,
-        help="Folder of pictures of a mirror ball under the same lights, and of its mask.",
-    ),
-    click.option(
-        "--mask",
-        type=PATH,
-        help="Picture that is bright on the subject.  [default: *mask* in SOURCE]",
-    ),
-    click.option(
-        "--response",
-        type=click.Choice(["auto", "srgb", "linear"]),
-        default="auto",
-        help="Values of the pictures; auto: 8 bits are sRGB, others are linear.",
-    ),
-    click.option(
-        "--width",
-        "width_mm",
-        type=Finite(0, MAX_WIDTH_MM, min_open=True),
-        help="Width of a picture on the subject in mm.  [default: 250 on the longer side]",
-    ),
-)
-
-
-def _pictures(command: Any) -> Any:
-    for option in reversed(PICTURES):
-        command = option(command)
-    return command
 
 
 @click.command("import")
@@ -82,18 +42,7 @@ def _pictures(command: Any) -> Any:
     "--reference", required=True, help="Reference to the signed consent form."
 )
 @click.option("--condition", default="normal", help="Condition of the skin.")
-@_pictures
-@click.option(
-    "--cameras",
-    type=PATH,
-    help=(
-        "Cameras of olat: a JSON file, or a folder with a text model of COLMAP.  "
-        "[default: cameras.json or SOURCE]"
-    ),
-)
-@click.option(
-    "--scan", type=PATH, help="Triangle mesh of olat in mm.  [default: that in SOURCE]"
-)
+@options_of(ImportParameters)
 @common
 def import_command(
     source: Path,
@@ -103,9 +52,7 @@ def import_command(
     consent: str,
     reference: str,
     condition: str,
-    cameras: Path | None,
-    scan: Path | None,
-    **pictures: Any,
+    parameters: ImportParameters,
 ) -> None:
     """Write the capture folder OUT from the pictures in the folder SOURCE.
 
@@ -120,20 +67,8 @@ def import_command(
             "reference": reference,
         },
     }
-    others = {"--cameras": cameras, "--scan": scan}
-    if layout == "olat":
-        others = {
-            f"--{name.replace('_mm', '').replace('_', '-')}": pictures.pop(name)
-            for name in ("mirror_ball", "mask", "width_mm")
-        }
-        pictures |= {"cameras": cameras, "mesh": scan}
-    for option, value in others.items():
-        if value is not None:
-            raise input_error(
-                option, f"does not apply to --as {layout}", str(value), "remove it"
-            )
     call = getattr(skindb.ingest, f"import_{layout}")
-    result = call(source, out, person, progress=bar(), **pictures)
+    result = call(source, out, person, progress=bar(), **asdict(parameters))
     for note in result.notes:
         echo(f"note: {note}", err=True)
     count = f"{result.lights} lights, {result.cameras} cameras"
@@ -146,9 +81,9 @@ def import_command(
 @click.command()
 @SOURCE
 @OUT
-@_pictures
+@options_of(QuickParameters)
 @common
-def quick(source: Path, out: Path, **pictures: Any) -> None:
+def quick(source: Path, out: Path, parameters: QuickParameters) -> None:
     """Estimate normals, albedo and gloss from the pictures in the folder SOURCE.
 
     The folder OUT gets maps, and a page to turn and light the subject in a browser.
@@ -156,7 +91,7 @@ def quick(source: Path, out: Path, **pictures: Any) -> None:
     """
     # the folder with copies of the pictures is removed at the end
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    result = skindb.workflow.quick(source, out, progress=bar(), **pictures)
+    result = skindb.workflow.quick(source, out, progress=bar(), **asdict(parameters))
     for note in result["notes"]:
         echo(f"note: {note}", err=True)
     total = sum(result["points"].values())

@@ -82,7 +82,7 @@ def read_sensor(
             "electrons, pixels are in values"
         )
         item.fault(missing[0], rule, "nothing", "add it, or remove both")
-    response, response_file = _response(folder, item, levels)
+    response, response_file = read_response(folder, item, levels)
     converter_bits = item.integer("adc_bits", minimum=1, maximum=16, default=bits)
     sensor = SensorRecord(
         kind=FrameKind(size.width, size.height, bits),
@@ -101,7 +101,7 @@ def read_sensor(
     return sensor
 
 
-def _response(
+def read_response(
     folder: Path, item: Fields, levels: tuple[float, float] | None
 ) -> tuple[Float64, Path] | tuple[None, None]:
     """The table of a response, and its file; its ends are checked unless the levels are

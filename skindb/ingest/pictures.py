@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import imagecodecs
 import numpy as np
@@ -30,6 +30,7 @@ from skindb.files import make_private, private_file, read_regular
 from skindb.format.fields import IDENTIFIER, Fields, read_json, short
 from skindb.format.folder import FORMAT, record_faults
 from skindb.format.frames import read_frame, write_frame
+from skindb.format.sensor import read_response
 from skindb.limits import (
     MAX_CAMERAS,
     MAX_FRAME_BYTES,
@@ -37,10 +38,10 @@ from skindb.limits import (
     MAX_LIGHTS,
     MAX_SCAN_BYTES,
 )
+from skindb.parameters import ImportParameters
 from skindb.types import Float64, Mask, Progress, silent
 
 Picture = NDArray[Any]  # (h, w, 3) uint8, uint16, or float radiance
-Response = Literal["auto", "srgb", "linear"]
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".exr")
 FORMATS = "PNG, TIFF, JPEG, BMP or OpenEXR"
 CAMERA = "c00"
@@ -88,12 +89,8 @@ def import_images(
     out: str | Path,
     person: Mapping[str, Any],
     *,
-    lights: str | Path | None = None,
-    mirror_ball: str | Path | None = None,
-    mask: str | Path | None = None,
-    response: Response = "auto",
-    width_mm: float | None = None,
     progress: Progress = silent,
+    **parameters: Any,
 ) -> Imported:
     """Write a capture folder from pictures of one camera, each under one light.
 
@@ -105,23 +102,13 @@ def import_images(
         Capture folder to write, which must not exist.
     person
         `subject`, `consent` and optional keys of capture.json, such as `condition`.
-    lights
-        Table of the lights (CSV or RTI .lp): a line for each picture with its file name
-        and the direction to the light, x to the right of the picture, y up, z to the
-        camera; or columns x_mm, y_mm, z_mm of positions. Default: lights.csv or the only
-        .lp file in the folder.
-    mirror_ball
-        Folder of pictures of a mirror ball under the same lights, in the same order, and
-        one picture `*mask*` of its disc; instead of `lights`.
-    mask
-        Picture that is bright on the subject; default: the picture `*mask*` in the folder,
-        if there is one.
-    response
-        "srgb" or "linear" values; "auto" takes pictures of 8 bits as sRGB.
-    width_mm
-        Width of the picture on the subject; default: 250 for the longer side.
     progress
         Callback.
+    **parameters
+        Of `skindb.parameters.PictureParameters`: lights, by default lights.csv or the
+        only .lp file in the folder; mirror_ball; mask, by default the picture `*mask*`
+        in the folder, if there is one; response; width_mm, by default 250 for the
+        longer side.
 
     Returns
     -------
@@ -135,42 +122,44 @@ def import_images(
         record with faults.
     """
     source, out = Path(source), Path(out)
+    chosen = _parameters(parameters, "pictures of one camera", "cameras", "scan")
     _require_writable(out, person)
     files = _pictures(source)
     masks = [file for file in files if MASK.search(file.stem.lower())]
     files = [file for file in files if file not in masks]
     require(
-        mask is not None or len(masks) < 2,
+        chosen.mask is not None or len(masks) < 2,
         str(source),
         "a folder must have at most one picture *mask*",
         ", ".join(file.name for file in masks[:3]),
         "name one with --mask",
     )
     notes = []
-    if mirror_ball is not None:
-        table = _from_ball(Path(mirror_ball), files)
+    if chosen.mirror_ball is not None:
+        table = _from_ball(chosen.mirror_ball, files)
         notes.append(f"{len(table)} directions of lights from the mirror ball")
     else:
-        table = read_lights(_table_file(source, lights))
-    chosen = _matched(source, files, table)
-    frames = _Frames(out, chosen[0], response)
+        table = read_lights(_table_file(source, chosen.lights))
+    matched = _matched(source, files, table)
+    frames = _Frames(out, matched[0], chosen.response)
     height, width = frames.size
-    inside = _mask(Path(mask) if mask else _only(masks), frames.size)
+    inside = _mask(chosen.mask or _only(masks), frames.size)
+    width_mm = chosen.width_mm
     if width_mm is None:
         width_mm = 250.0 * width / max(width, height)
         notes.append(
             f"the picture is taken as {width_mm:.0f} mm wide on the subject; --width states it"
         )
-    if unused := len(files) - len(chosen):
+    if unused := len(files) - len(matched):
         notes.append(f"{unused} pictures have no light and are not used")
     ids = _ids([light.name for light in table])
     camera = _distant_camera(width, height, width_mm)
     with _whole(out):
-        for k, (file, name) in enumerate(zip(chosen, ids, strict=True)):
+        for k, (file, name) in enumerate(zip(matched, ids, strict=True)):
             frames.add(file, name, camera, inside)
-            progress("import", k + 1, len(chosen))
+            progress("import", k + 1, len(matched))
         frames.finish(person, [camera], table, ids)
-    return Imported(out, len(chosen), 1, (*notes, *frames.notes))
+    return Imported(out, len(matched), 1, (*notes, *frames.notes))
 
 
 def import_olat(
@@ -178,11 +167,8 @@ def import_olat(
     out: str | Path,
     person: Mapping[str, Any],
     *,
-    lights: str | Path | None = None,
-    cameras: str | Path | None = None,
-    mesh: str | Path | None = None,
-    response: Response = "auto",
     progress: Progress = silent,
+    **parameters: Any,
 ) -> Imported:
     """Write a capture folder from a light stage: one picture for each light and camera.
 
@@ -191,17 +177,12 @@ def import_olat(
     source
         Folder with the pictures as CAMERA/LIGHT, LIGHT/CAMERA, CAMERA_LIGHT or
         LIGHT_CAMERA with any suffix of a picture.
-    out, person, response, progress
+    out, person, progress
         As in `import_images`.
-    lights
-        Table of the lights as in `import_images`, in the frame of the cameras; names are
-        those in the pictures. Default: lights.csv in the folder.
-    cameras
-        JSON with a list of `id, K, R, t` and optional `width, height, distortion`, as in
-        dome.json, or a folder with cameras.txt and images.txt of COLMAP, whose images
-        are named after the cameras. Default: cameras.json, or the folder itself.
-    mesh
-        Scan in mm, PLY or OBJ; default: the only one in the folder. One camera needs none.
+    **parameters
+        Of `skindb.parameters.ImportParameters`: lights, as in `import_images`; response;
+        cameras, by default cameras.json or the folder itself; scan, by default the only
+        one in the folder.
 
     Returns
     -------
@@ -214,12 +195,13 @@ def import_olat(
         With every picture that is absent, unreadable or of another size than its camera.
     """
     source, out = Path(source), Path(out)
+    chosen = _parameters(parameters, "a light stage", "mirror_ball", "mask", "width_mm")
     _require_writable(out, person)
-    table = read_lights(_table_file(source, lights))
-    devices = _read_cameras(source, Path(cameras) if cameras else None)
+    table = read_lights(_table_file(source, chosen.lights))
+    devices = _read_cameras(source, chosen.cameras)
     names = [light.name for light in table]
     pattern, files = _olat_files(source, names, [str(c["id"]) for c in devices])
-    frames = _Frames(out, next(iter(files.values())), response)
+    frames = _Frames(out, next(iter(files.values())), chosen.response)
     ids = _ids(names)
     light_ids = dict(zip(names, ids, strict=True))
     camera_ids = _ids([str(c["id"]) for c in devices])
@@ -227,16 +209,31 @@ def import_olat(
     for device, name in zip(devices, camera_ids, strict=True):
         device["id"] = name
     meshes = sorted([*source.glob("*.ply"), *source.glob("*.obj")])
-    scan = Path(mesh) if mesh else _only(meshes)
-    content = b"" if scan is None else read_regular(scan, MAX_SCAN_BYTES)
+    scan = chosen.scan or _only(meshes)
     with _whole(out):
         for k, ((light, camera), file) in enumerate(files.items()):
             frames.add(file, light_ids[light], by_name[camera])
             progress("import", k + 1, len(files))
-        suffix = "" if scan is None else scan.suffix.lower()
-        frames.finish(person, devices, table, ids, content, suffix)
+        frames.finish(person, devices, table, ids, scan)
     notes = (f"pictures are {pattern}{frames.first.suffix}", *frames.notes)
     return Imported(out, len(table), len(devices), notes)
+
+
+def _parameters(
+    values: Mapping[str, Any], source: str, *foreign: str
+) -> ImportParameters:
+    """The parameters of an import, none of which belongs to other sources."""
+    paths = ("lights", "mirror_ball", "mask", "cameras", "scan")
+    stated = {n: Path(values[n]) for n in paths if values.get(n) is not None}
+    chosen = ImportParameters(**{**values, **stated})
+    faults = [
+        Fault(name, f"does not apply to {source}", str(value), "remove it")
+        for name in foreign
+        if (value := getattr(chosen, name)) is not None
+    ]
+    if faults:
+        raise InputError(faults)
+    return chosen
 
 
 @contextmanager
@@ -264,23 +261,38 @@ def _white_level(bright: float) -> float:
 class _Frames:
     """The frames of a capture folder that is written from pictures."""
 
-    def __init__(self, out: Path, first: Path, response: Response) -> None:
+    def __init__(self, out: Path, first: Path, response: str) -> None:
         picture = read_picture(first)
         self.out = out
         self.first = first
         self.size = picture.shape[:2]
         self.dtype = picture.dtype
         self.linear = picture.dtype.kind == "f"
-        eight = picture.dtype == np.uint8
-        automatic = response == "auto" and eight
-        self.srgb = automatic or (response == "srgb" and not self.linear)
         self.suffix = ".exr" if self.linear else ".png"
+        automatic = response == "auto" and picture.dtype == np.uint8
+        # table of the response; empty for linear values
+        self.response = self._table(response, automatic)
         self.levels = list[float]()
         self.faults = list[Fault]()
         self.newest = 0.0  # time of the newest picture
         self.notes = [
             "pictures of 8 bits are taken as sRGB; --response linear if they are not"
         ] * automatic
+
+    def _table(self, response: str, automatic: bool) -> str:
+        """Table of a response that is a word or a file; empty for linear values."""
+        if self.linear or (response in ("auto", "linear") and not automatic):
+            return ""
+        count = 2 ** (8 * self.dtype.itemsize)
+        if automatic or response == "srgb":
+            return _srgb_table(count)
+        file = Path(response)
+        faults = list[Fault]()
+        fields = Fields({"response": file.name}, str(file.parent), faults)
+        read_response(file.parent, fields, (0, count - 1))
+        if faults:
+            raise InputError(faults)
+        return file.read_text(encoding="utf-8")
 
     def add(
         self,
@@ -325,24 +337,17 @@ class _Frames:
         cameras: list[dict[str, Any]],
         lights: Sequence[Light],
         ids: Sequence[str],
-        scan: bytes = b"",
-        suffix: str = "",
+        scan: Path | None = None,
     ) -> None:
-        """Write the other files, capture.json last.
-
-        `scan` is the content of the file of a scan, if there is one.
-        """
+        """Write the other files, capture.json last."""
         if self.faults:
             raise InputError(self.faults)
         bits = 8 * self.dtype.itemsize
         for camera in cameras:
             camera |= {} if self.linear else {"bit_depth": bits}
-            if self.srgb:
-                camera["response"] = "dome/response.csv"
-        if self.srgb:
-            private_file(self.out / "dome/response.csv").write_text(
-                _srgb_table(2**bits)
-            )
+            camera |= {"response": "dome/response.csv"} if self.response else {}
+        if self.response:
+            private_file(self.out / "dome/response.csv").write_text(self.response)
         white = _white_level(max(self.levels, default=1.0))
         if white != 1:
             self.notes.append(
@@ -357,9 +362,10 @@ class _Frames:
         }
         time = datetime.fromtimestamp(self.newest, UTC)
         record = _record(person, time) | {"dome": "dome/dome.json"}
-        if suffix:
-            record["mesh"] = f"scan{suffix}"
-            private_file(self.out / record["mesh"]).write_bytes(scan)
+        if scan is not None:
+            record["mesh"] = f"scan{scan.suffix.lower()}"
+            content = read_regular(scan, MAX_SCAN_BYTES)
+            private_file(self.out / record["mesh"]).write_bytes(content)
         for name, value in (("dome/dome.json", dome), ("capture.json", record)):
             text = json.dumps(value, indent=1)
             private_file(self.out / name).write_text(text, encoding="utf-8")
@@ -528,10 +534,10 @@ def _table_fault(path: Path, rule: str, found: str) -> InputError:
     return input_error(str(path), f"a table of lights {rule}", found, "correct it")
 
 
-def _table_file(source: Path, given: str | Path | None) -> Path:
+def _table_file(source: Path, given: Path | None) -> Path:
     """The table of the lights."""
     if given is not None:
-        return Path(given)
+        return given
     table = source / "lights.csv"
     listed = sorted(source.glob("*.lp"))
     if not table.exists() and len(listed) == 1:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import re
 import tempfile
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +13,16 @@ from numpy.typing import NDArray
 
 from skindb.errors import require
 from skindb.files import make_private, private_umask
-from skindb.format.fields import NAME, read_json
+from skindb.fit.plan import RELATIVE
+from skindb.format.fields import read_json
 from skindb.geometry.camera import project
-from skindb.ingest.pictures import Response, import_images
+from skindb.ingest.pictures import import_images
 from skindb.optics.fresnel import fresnel_transmittance
+from skindb.parameters import FitParameters, QuickParameters
 from skindb.render.image import write_exr, write_png
 from skindb.schema import FitStatus
 from skindb.store.database import Database
-from skindb.types import Float64, Progress
+from skindb.types import Float64, Progress, silent
 from skindb.workflow.captures import ingest_take
 from skindb.workflow.fit import fit_take
 from skindb.workflow.pictures import view_takes
@@ -37,19 +39,15 @@ def quick(
     source: str | Path,
     out: str | Path,
     *,
-    lights: str | Path | None = None,
-    mirror_ball: str | Path | None = None,
-    mask: str | Path | None = None,
-    response: Response = "auto",
-    width_mm: float | None = None,
     progress: Progress | None = None,
+    **parameters: Any,
 ) -> dict[str, Any]:
     """Maps of normals, albedo and gloss, and a page to turn and light them, from pictures
     of one camera.
 
     Parameters
     ----------
-    source, lights, mirror_ball, mask, response, width_mm, progress
+    source, progress
         As in `skindb.ingest.import_images`.
     out
         Folder to write: normals, albedo and gloss as .png and .exr, and page.html.
@@ -57,6 +55,8 @@ def quick(
         Albedo is the fraction of light along the normal that is reflected in total,
         gloss the part of the surface; both are relative.
         It must not hold these files.
+    **parameters
+        Of `skindb.parameters.QuickParameters`: eta, and those of `import_images`.
 
     Returns
     -------
@@ -75,21 +75,17 @@ def quick(
     rule = "results are not replaced"
     cure = "name another folder, or remove them"
     require(not present, str(out), rule, ", ".join(present), cure)
-    name = re.sub(r"[^A-Za-z0-9_-]+", "-", Path(source).resolve().name)[:64].strip("-")
-    subject = name if re.fullmatch(NAME.pattern, name) else "pictures"
+    known = asdict(QuickParameters(**parameters))
+    fit = FitParameters(eta=known.pop("eta"))
     consent = {"scope": ["fit", "export"], "reference": "quick, nothing is stored"}
     with private_umask(), tempfile.TemporaryDirectory(prefix="skindb-") as folder:
         capture = Path(folder) / "capture"
         imported = import_images(
             source,
             capture,
-            {"subject": subject, "consent": consent},
-            lights=lights,
-            mirror_ball=mirror_ball,
-            mask=mask,
-            response=response,
-            width_mm=width_mm,
-            **({} if progress is None else {"progress": progress}),
+            {"subject": "pictures", "consent": consent},
+            progress=progress or silent,
+            **known,
         )
         (camera,) = read_json(capture / "dome/dome.json", [])["cameras"]
         pixel = camera["t"][2] / camera["K"][0][0]
@@ -97,13 +93,12 @@ def quick(
         step = max(int(np.ceil(np.sqrt(area / MAX_POINTS))), 1)
         db = Database(Path(folder) / "db")
         record = ingest_take(db, capture, spacing_mm=step * pixel, progress=progress)
-        fit_take(db, record.take, progress=progress)
+        fit_take(db, record.take, fit, progress=progress)
         make_private(out)
         view_takes(db, [record.take], out / PAGE, progress=progress)
         model = db.read("model", record.take)
         result = _write_maps(model, out, step)
-        skipped = [line for line in model.attrs["skipped"] if "white" in line]
-    notes = [*imported.notes, *skipped]
+    notes = [*imported.notes, RELATIVE]
     return {"files": [str(out / name) for name in names], "notes": notes} | result
 
 

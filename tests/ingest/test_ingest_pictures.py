@@ -130,6 +130,23 @@ def test_formats_give_the_same_normals(
     assert np.median(miss) < 3
 
 
+def test_a_stated_response_gives_the_same_samples(tmp_path: Path) -> None:
+    folder = tmp_path / "source"
+    names = write_pictures(folder, LIGHTS, dtype="uint8", srgb=True)
+    write_table(folder / "lights.csv", names, LIGHTS)
+    import_images(folder, tmp_path / "srgb", PERSON)
+    table = tmp_path / "srgb/dome/response.csv"
+    import_images(folder, tmp_path / "stated", PERSON, response=str(table))
+    record = json.loads((tmp_path / "stated/dome/dome.json").read_text())
+    assert record["cameras"][0]["response"] == "dome/response.csv"
+    stated = tmp_path / "stated/dome/response.csv"
+    assert stated.read_text() == table.read_text()
+    table.write_text("dn,r,g,b\n0,0,0,0\n")
+    with pytest.raises(InputError, match="columns dn,r,g,b that all rise"):
+        import_images(folder, tmp_path / "refused", PERSON, response=str(table))
+    assert not (tmp_path / "refused").exists()
+
+
 def test_near_lights_are_used_at_their_positions(tmp_path: Path) -> None:
     folder = tmp_path / "pictures"
     folder.mkdir()

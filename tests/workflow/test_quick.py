@@ -49,7 +49,7 @@ def run(*words: object) -> subprocess.CompletedProcess[str]:
 
 def test_quick_writes_maps_and_a_page(pictures: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    result = run("quick", pictures, out, "--no-progress")
+    result = run("quick", pictures, out, "--eta", 1, "--no-progress")
     assert result.returncode == 0, result.stderr
     assert "relative" in result.stderr
     normal = read_exr(out / "normals.exr")[0]
@@ -57,13 +57,16 @@ def test_quick_writes_maps_and_a_page(pictures: Path, tmp_path: Path) -> None:
     inner = truth[..., 2] > 0.5
     cosine = (normal * truth).sum(axis=-1)[inner]
     assert np.isfinite(cosine).mean() > 0.99
-    # the sphere is matt without the smooth boundary of skin, whose transmittance depends
-    # on the angle: by 2.4 degrees in the median of all normals
-    assert np.degrees(np.arccos(np.nanquantile(cosine.clip(-1, 1), 0.5))) < 3
+    # with the smooth boundary of skin, which the sphere lacks, 2.4 degrees
+    assert np.degrees(np.arccos(np.nanquantile(cosine.clip(-1, 1), 0.5))) < 0.5
     albedo = read_exr(out / "albedo.exr")[0][inner]
     assert np.nanmedian(albedo[:, 2] / albedo[:, 0]) == pytest.approx(0.6, rel=0.02)
     assert read_png(out / "normals.png").shape == (*truth.shape[:2], 4)
-    assert "<script" in (out / "page.html").read_text()
+    page = (out / "page.html").read_text()
+    assert "<script" in page
+    # the name of the folder may be that of a person
+    assert "my pictures" not in page
+    assert "my-pictures" not in page
     again = run("quick", pictures, out, "--no-progress")
     assert again.returncode == 1
     assert "results are not replaced" in again.stderr
@@ -97,8 +100,8 @@ def test_import_then_ingest_and_fit(pictures: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--as", "olat", "--mask", "x.png"], "--mask: does not apply"),
-        (["--as", "images", "--scan", "x.ply"], "--scan: does not apply"),
+        (["--as", "olat", "--mask", "x.png"], "mask: does not apply"),
+        (["--as", "images", "--scan", "x.ply"], "scan: does not apply"),
         (["--as", "images", "--consent", "all"], "must be from"),
         (["--as", "images", "--subject", "Jane Doe"], "letters, digits"),
         (["--as", "images", "--lights", "gone.csv"], "gone.csv"),
