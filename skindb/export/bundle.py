@@ -515,18 +515,17 @@ def _errors(fitted: xr.Dataset) -> dict[str, Any]:
         if (status == member).any()
     }
     for name in names_of(Use.EXPORTED):
-        if name not in fitted:
-            continue
-        values = fitted[name].values
+        values = fitted[name].values if name in fitted else np.zeros(0)
         finite = values[np.isfinite(values)]
-        quantiles = (
-            np.quantile(finite, [0.5, 0.95]) if finite.size else [np.nan, np.nan]
-        )
-        meaning = {"units": VARIABLES[name].units, "meaning": VARIABLES[name].doc}
+        if not finite.size:
+            continue
+        median, high = np.quantile(finite, [0.5, 0.95])
         report[name] = {
-            "median": float(quantiles[0]),
-            "quantile_95": float(quantiles[1]),
-        } | meaning
+            "median": float(median),
+            "quantile_95": float(high),
+            "units": VARIABLES[name].units,
+            "meaning": VARIABLES[name].doc,
+        }
     return report
 
 

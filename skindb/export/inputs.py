@@ -18,6 +18,7 @@ from skindb.optics.diffusion import (
     dipole_s,
     scattering_coefficients,
 )
+from skindb.render.surfels import with_matt_surfels
 from skindb.schema import check, variables
 from skindb.types import Array
 
@@ -105,7 +106,7 @@ def required(model: xr.DataTree) -> xr.Dataset:
     InputError
         If variables are missing, or the texture coordinates are not finite or cover no area.
     """
-    fitted = model["fitted"].to_dataset()
+    fitted = with_matt_surfels(model["fitted"].to_dataset())
     check(fitted, REQUIRED, where="fitted")
     corner = (
         fitted[variables.SURFEL_UV]

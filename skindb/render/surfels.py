@@ -19,7 +19,12 @@ from skindb.types import Array
 
 Codes = NDArray[np.uint8]
 STATUS = {FitStatus.FITTED: TexelStatus.MEASURED} | dict.fromkeys(
-    (FitStatus.DIFFUSE_CLAMPED, FitStatus.NOT_CONVERGED, FitStatus.OBSTRUCTED),
+    (
+        FitStatus.DIFFUSE_CLAMPED,
+        FitStatus.NOT_CONVERGED,
+        FitStatus.OBSTRUCTED,
+        FitStatus.LAMBERT,
+    ),
     TexelStatus.DOUBTFUL_FIT,
 )
 # confidence by `TexelStatus`
@@ -33,6 +38,13 @@ ERROR_INPUTS = (
     variables.SMALLEST_HALF_ANGLE,
 )
 MAX_LENGTH_ERROR = 1e-3  # of a unit direction; directions in half precision have 5e-4
+
+
+def with_matt_surfels(fitted: xr.Dataset) -> xr.Dataset:
+    """The surfels without gloss, instead of an unknown one, where three samples do not show it."""
+    matt = fitted[variables.FIT_STATUS] == FitStatus.LAMBERT
+    surface = [name for name in names_of(Use.SURFACE) if name in fitted]
+    return fitted.assign({name: fitted[name].where(~matt, 0) for name in surface})
 
 
 def surfel_texels(fitted: xr.Dataset) -> Codes:
@@ -65,13 +77,9 @@ def surfel_texels(fitted: xr.Dataset) -> Codes:
     return code
 
 
-def surfel_confidence(fitted: xr.Dataset, *, matt: bool = False) -> NDArray[np.float32]:
-    """(n,) 1 for fitted surfels, 0.5 for doubtful fits and, if they are wanted, `matt`
-    ones without a surface, 0 for all others.
-    """
+def surfel_confidence(fitted: xr.Dataset) -> NDArray[np.float32]:
+    """(n,) 1 for fitted surfels, 0.5 for doubtful fits, 0 for all others."""
     trust: NDArray[np.float32] = TRUST[surfel_texels(fitted)]
-    if matt:
-        trust[fitted[variables.FIT_STATUS].values == FitStatus.LAMBERT] = 0.5
     if not trust.any():
         rule = "at least one surfel must be fitted for an export"
         raise InputError(

@@ -22,7 +22,7 @@ from skindb.render.image import tone_map
 from skindb.render.monte_carlo import Lighting
 from skindb.render.rendering import chosen_camera, chosen_lights, fixed_exposure, render
 from skindb.render.scene import LUMINANCE, Environment, Surface, from_model
-from skindb.render.surfels import surfel_confidence
+from skindb.render.surfels import surfel_confidence, with_matt_surfels
 from skindb.schema import variables
 from skindb.schema.consent import honour_consent
 from skindb.schema.notes import Omission
@@ -387,8 +387,9 @@ def _quality(model: xr.DataTree, surface: Surface) -> Float:
                 fitted[name].values / np.maximum(surface.diffuse, MIN_ALBEDO)
             ).mean(axis=1)
             break
+    trust = surfel_confidence(with_matt_surfels(fitted))
     return np.stack(
-        [surfel_confidence(fitted, matt=True), np.clip(np.nan_to_num(error), 0, 10)],
+        [trust, np.clip(np.nan_to_num(error), 0, 10)],
         axis=1,
     )
 

@@ -262,3 +262,18 @@ def test_texture_maps__nothing_fitted_is_said(model: xr.DataTree) -> None:
         InputError, match="at least one surfel must be fitted for an export; found none"
     ):
         texture_maps(model, size=SIZE)
+
+
+def test_texture_maps__surfels_of_three_samples_are_matt(model: xr.DataTree) -> None:
+    fitted = model["fitted"].to_dataset()
+    status = fitted["fit_status"].values
+    status[status == FitStatus.FITTED] = FitStatus.LAMBERT
+    fitted["basis_weight"].values[:] = np.nan
+    model["fitted"] = fitted
+    maps, (u, v) = texture_maps(model, size=SIZE), grid()
+    inner = np.minimum.reduce([u - 0.1, v - 0.1, 0.7 - u, 0.7 - v]) > 0
+    assert (maps["weight_0"].values == 0).all()
+    np.testing.assert_allclose(
+        maps["albedo"].values[inner, 0], 0.2 + 0.5 * u[inner], atol=2e-3
+    )
+    np.testing.assert_allclose(maps["confidence"].values[inner], 0.5, atol=1e-6)
