@@ -111,6 +111,7 @@ def _info_lines(
                 f"  out of date: {version['stale'][0]}" if version.get("stale") else ""
             )
             lines.append(f"{take:<16} {kind:<10} {text}")
+            lines += [f"  {line}" for line in calibrated_by_lines(version)]
             if kind in DETAILS and "fault" not in version and details:
                 lines += [f"  {line}" for line in _details(database, kind, take)]
     return lines
@@ -185,11 +186,9 @@ def _atlas_lines(database: Database, take: str) -> list[str]:
 
 
 def _capture_lines(database: Database, take: str) -> list[str]:
-    provenance = database.record("capture", take).provenance
-    summary = provenance.get("summary", {})
+    summary = database.record("capture", take).provenance.get("summary", {})
     parts = (_sample_lines, _atlas_lines, calibration_lines)
     return [
-        *calibrated_by_lines(provenance),
         *[line for part in parts for line in part(database, take)],
         *choice_lines(summary.get("corrections", {})),
     ]

@@ -175,4 +175,6 @@ def _describe(lookup: Lookup, stale: Staleness, kind: str, take: str) -> dict[st
         return summary | {"scope": list(consent_scope(record.provenance))}
     if reasons:
         summary["stale"] = list(map(str, reasons))
+    known = ("calibration", "calibrated_by") if kind == "capture" else ()
+    summary |= {x: record.provenance[x] for x in known if x in record.provenance}
     return summary | {"status": record.provenance.get("status", {})}

@@ -41,6 +41,8 @@ SHARED_PARTS = (
     "dictionary_digest",
     "summary_parameters",
     "consent_scope",
+    "calibration",
+    "calibrated_by",
 )
 # parts that the catalogue shows or uses
 CACHED_PARTS = (

@@ -130,8 +130,9 @@ def test_ingest__a_sixth_take_is_measured_better_by_default_and_says_so(rig):
     line = "calibration dome, version 1, made from takes with its lights"
     assert result.exit_code == 0, result.output
     assert line in result.output
-    shown = CliRunner().invoke(cli, ["info", str(rig.db.folder), "-v"]).output
-    assert shown.count(line) == 1
+    for words in ([], ["-v"]):
+        shown = CliRunner().invoke(cli, ["info", str(rig.db.folder), *words]).output
+        assert shown.count(line) == 1
     assert spread(lights_of(rig, "S5") / GAINS) < TOLERANCE
     workflow.fit_take(rig.db, "S5")
     assert normal_error(rig, "S5") < before / 2
