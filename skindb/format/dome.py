@@ -58,6 +58,9 @@ SEQUENCE_CURE = "write what the controller acknowledged, or remove the sequence"
 # radii from the centre to a corner at which the gain of a lens is checked
 VIGNETTE_STEPS = 1000
 
+# of exposures that are taken as equal: EXIF rounds them
+EXPOSURE_RATIO = 1.02
+
 
 @dataclass(frozen=True)
 class Pinhole:
@@ -155,6 +158,8 @@ class DomeRecord:
     sequence: SequenceRecord | None = None
     # intensities are known up to a common factor for each channel
     relative: bool = False
+    # takes of one rig without intensities are comparable if it is equal; 0 unknown
+    relative_exposure: float = 0.0
 
     @property
     def frame_count(self) -> int:
@@ -235,6 +240,7 @@ def read_dome(
         Path(fields.where),
         sequence,
         relative and white is None,
+        fields.number("relative_exposure", default=0.0, minimum=0),
     )
     _check_frames(dome, fields)
     return dome

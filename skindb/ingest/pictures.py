@@ -8,6 +8,7 @@ import io
 import json
 import re
 import shutil
+import struct
 import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -21,12 +22,13 @@ import imagecodecs
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
+from PIL import ExifTags, Image, ImageOps
 from scipy.spatial.transform import Rotation
 
 from skindb.calibration.lights import ball_outline, distant_light, highlight_centre
 from skindb.errors import Fault, InputError, attempt, input_error, require
 from skindb.files import make_private, private_file, read_regular
+from skindb.format.dome import EXPOSURE_RATIO
 from skindb.format.fields import IDENTIFIER, Fields, read_json, short
 from skindb.format.folder import FORMAT, record_faults
 from skindb.format.frames import read_frame, write_frame
@@ -274,6 +276,8 @@ class _Frames:
         self.response = self._table(response, automatic)
         self.levels = list[float]()
         self.faults = list[Fault]()
+        self.exposures = dict[float, str]()  # by EXIF -> a file
+        self.automatic_white = False
         self.newest = 0.0  # time of the newest picture
         self.notes = [
             "pictures of 8 bits are taken as sRGB; --response linear if they are not"
@@ -330,6 +334,10 @@ class _Frames:
         make_private(target.parent)
         write_frame(target, picture)
         self.newest = max(self.newest, file.stat().st_mtime)
+        exposure, automatic_white = _exif(file)
+        self.automatic_white |= automatic_white
+        if exposure > 0:
+            self.exposures.setdefault(exposure, file.name)
 
     def finish(
         self,
@@ -342,6 +350,22 @@ class _Frames:
         """Write the other files, capture.json last."""
         if self.faults:
             raise InputError(self.faults)
+        low, high = (f(self.exposures, default=0.0) for f in (min, max))
+        same = high <= EXPOSURE_RATIO * low
+        require(
+            same or len({light.gain for light in lights}) > 1,
+            str(self.first.parent),
+            "all pictures must have one exposure, unless intensities of the lights are stated",
+            f"by EXIF that of {self.exposures.get(low)} times {high / (low or 1):.3g} "
+            f"for {self.exposures.get(high)}",
+            "photograph again with the exposure set by hand, or multiply each intensity in "
+            "the table of lights by the exposure of its picture",
+        )
+        if self.automatic_white:
+            self.notes.append(
+                "the camera chose the white balance of each picture (EXIF): colours are "
+                "less certain, and takes differ by it; set it by hand"
+            )
         bits = 8 * self.dtype.itemsize
         for camera in cameras:
             camera |= {} if self.linear else {"bit_depth": bits}
@@ -353,6 +377,8 @@ class _Frames:
             self.notes.append(
                 f"radiance {white:g} is taken as white: takes with another one cannot be compared"
             )
+        # what white has depends on it
+        exposure = float(np.median([*self.exposures] or [float(self.linear)])) / white
         dome = {
             "cameras": cameras,
             "lights": _light_records(lights, ids, white),
@@ -360,6 +386,8 @@ class _Frames:
             "exposures": [{"id": "e0", "seconds": 1.0}],
             "frames": f"dome/frames/{{light}}_{{camera}}{self.suffix}",
         }
+        if exposure > 0:
+            dome["relative_exposure"] = exposure
         time = datetime.fromtimestamp(self.newest, UTC)
         record = _record(person, time) | {"dome": "dome/dome.json"}
         if scan is not None:
@@ -452,6 +480,26 @@ def read_picture(path: Path) -> Picture:
     if picture.shape[2] < 3:
         picture = np.repeat(picture[..., :1], 3, axis=2)
     return np.array(picture[..., :3])
+
+
+def _exif(path: Path) -> tuple[float, bool]:
+    """Exposure by EXIF, seconds x ISO / (100 x f-number^2), 0 if it is not stated; and
+    whether the camera chose the white balance.
+    """
+    base = ExifTags.Base
+    try:
+        with Image.open(path, formats=("JPEG", "PNG", "TIFF")) as image:
+            tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
+        exposure = (
+            float(tags.get(base.ExposureTime, 0))
+            * float(tags.get(base.ISOSpeedRatings, 100) or 100)
+            / (100 * float(tags.get(base.FNumber, 1) or 1) ** 2)
+        )
+    except (OSError, ValueError, TypeError, SyntaxError, ArithmeticError, struct.error):
+        return 0.0, False  # faulty tags are no faults of the picture
+    return (exposure if 0 < exposure < np.inf else 0.0), tags.get(
+        base.WhiteBalance
+    ) == 0
 
 
 def _tiff(content: bytes) -> Picture:

@@ -52,9 +52,10 @@ def capture_provenance(
         file.relative_to(capture.folder).as_posix(): _sha256([file])
         for file in _files(capture)
     }
+    dome = capture.dome
     files = set[Path]()
-    if capture.dome is not None:
-        files.update(capture.dome.frame_files("frames", "dark", "white"))
+    if dome is not None:
+        files.update(dome.frame_files("frames", "dark", "white"))
     if capture.probe is not None:
         files.update(capture.probe.frame_files())
     frames = sorted(files)
@@ -65,6 +66,7 @@ def capture_provenance(
         "calibration": capture.calibration,
         "calibrated_by": dict(capture.calibrated_by or {}),
         "override": dict(capture.override),
+        "relative_exposure": 0.0 if dome is None else dome.relative_exposure,
     }
     return {
         "subject": capture.subject,

@@ -355,6 +355,7 @@ PROVENANCE: dict[str, Test] = {
     "inputs": lambda value: _is_object(value) or _is_list_of(_is_input, value),
     "consent_scope": lambda value: value is None or _is_list_of(_is_text, value),
     "calibrated_by": _is_input,
+    "relative_exposure": lambda value: isinstance(value, float),
     "traits": _is_object,
     "parameters": _is_object,
     "status": _is_object,

@@ -7,6 +7,7 @@ import inspect
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, asdict, fields
 from functools import partial, wraps
 from pathlib import Path
@@ -20,7 +21,8 @@ from skindb.analysis.registration import describe_registration
 from skindb.analysis.studies import STUDIES
 from skindb.analysis.study import Population, Study
 from skindb.analysis.subjects import CONDITION, subjects_of, subjects_without_normal
-from skindb.errors import input_error
+from skindb.errors import InputError, input_error, require
+from skindb.format.dome import EXPOSURE_RATIO
 from skindb.parameters import option_of, require_limits
 from skindb.reflectance.brdf_files import read_dictionary
 from skindb.reflectance.dictionary import convolve_disc, embedded_dictionary
@@ -146,22 +148,39 @@ def _require_models(db: Database, takes: Sequence[str], release: str | None) -> 
     summarise(db, [take for take in takes or models if take in models], release=release)
 
 
-def _require_one_scale(study: Study, inputs: Sequence[Record]) -> None:
+def _require_one_scale(db: Database, study: Study, inputs: Sequence[Record]) -> None:
     """Refuse models whose reflectance cannot be compared: with and without a white target,
-    or without one where absolute values are needed.
+    or without one where absolute values are needed or photographs had other exposures.
     """
     models = [record for record in inputs if record.kind == "model"]
-    relative = [x.take for x in models if x.provenance.get("relative_reflectance")]
-    if not relative or (len(relative) == len(models) and not study.absolute):
+    relative = [x for x in models if x.provenance.get("relative_reflectance")]
+    if not relative:
         return
     rule = "all takes of a study must have absolute reflectance, or all relative"
     if study.absolute:
         rule = f"the study {study.name} needs absolute reflectance"
-    raise input_error(
-        ", ".join(relative[:3]) + (", ..." if len(relative) > 3 else ""),
+    names = [record.take for record in relative]
+    require(
+        len(relative) == len(models) and not study.absolute,
+        ", ".join(names[:3]) + (", ..." if names[3:] else ""),
         rule,
         f"{len(relative)} of {len(models)} takes without a white target",
         "name takes of one kind with --take",
+    )
+    exposures = dict[float, str]()
+    for record in relative:
+        for key in record.input_keys:
+            with suppress(InputError):  # the capture was removed since
+                about = db.record(*key).provenance
+                exposures[about.get("relative_exposure", 0.0)] = record.take
+    exposures.pop(0.0, None)  # unknown
+    low, high = (f(exposures, default=0.0) for f in (min, max))
+    require(
+        high <= EXPOSURE_RATIO * low,
+        ", ".join(exposures[x] for x in {low, high} & exposures.keys()),
+        "takes without a white target are comparable if their pictures have one exposure",
+        f"{low:.3g} and {high:.3g}, which the imports recorded",
+        "name takes of one exposure with --take",
     )
 
 
@@ -313,7 +332,7 @@ def study(
         population, inputs = open_population(
             db, record, takes=takes, release=release, dictionary=dictionary
         )
-        _require_one_scale(record, inputs)
+        _require_one_scale(db, record, inputs)
         derivation = _derivation(db, key, record, requested, population, inputs)
         # the file of a dictionary may change: a study with one is always computed
         if dictionary is not None or derivation.current() is None:

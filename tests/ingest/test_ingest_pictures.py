@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import unicodedata
+from collections.abc import Sequence
 from pathlib import Path
 
 import imagecodecs
 import numpy as np
 import pytest
 import tifffile
-from PIL import Image
+from PIL import ExifTags, Image
 from planted_pictures import (
     ALBEDO,
     SIZE,
@@ -213,6 +214,42 @@ def test_jpeg_is_turned_as_it_is_looked_at(tmp_path: Path) -> None:
     picture = read_picture(tmp_path / "x.jpg")
     assert picture.shape == (30, 20, 3)
     assert picture[:8].min() > 180 > 20 > picture[12:].max()
+
+
+def write_photographs(folder: Path, seconds: Sequence[float]) -> list[str]:
+    """JPEG pictures whose EXIF states exposures."""
+    stems = write_pictures(folder, LIGHTS, dtype="uint8", srgb=True)
+    for stem, time in zip(stems, seconds, strict=True):
+        path = folder / stem
+        exif = Image.Exif()
+        tags = exif.get_ifd(ExifTags.IFD.Exif)
+        tags[ExifTags.Base.ExposureTime] = time
+        tags[ExifTags.Base.ISOSpeedRatings] = 200
+        tags[ExifTags.Base.FNumber] = 2.0
+        tags[ExifTags.Base.WhiteBalance] = 0
+        Image.open(path).save(path.with_suffix(".jpg"), quality=98, exif=exif)
+        path.unlink()
+    return [f"{Path(stem).stem}.jpg" for stem in stems]
+
+
+def test_exposures_of_pictures_are_compared_and_recorded(tmp_path: Path) -> None:
+    times = np.full(len(LIGHTS), 0.01)
+    names = write_photographs(tmp_path / "even", times)
+    write_table(tmp_path / "even/lights.csv", names, LIGHTS)
+    result = import_images(tmp_path / "even", tmp_path / "capture", PERSON)
+    dome = json.loads((tmp_path / "capture/dome/dome.json").read_text())
+    assert dome["relative_exposure"] == pytest.approx(0.01 * 2 / 4)
+    assert "white balance" in " ".join(result.notes)
+    times[3] = 0.04
+    names = write_photographs(tmp_path / "uneven", times)
+    table = tmp_path / "uneven/lights.csv"
+    write_table(table, names, LIGHTS)
+    with pytest.raises(InputError, match=r"times 4 for picture 3\.jpg"):
+        import_images(table.parent, tmp_path / "again", PERSON)
+    rows = table.read_text().splitlines()
+    rows = [f"{row},{time}" for row, time in zip(rows[1:], times, strict=True)]
+    table.write_text("\n".join(["picture,x,y,z,intensity", *rows]))
+    import_images(table.parent, tmp_path / "again", PERSON)
 
 
 def test_a_mask_and_grey_pictures(pictures: Path, tmp_path: Path) -> None:

@@ -134,8 +134,31 @@ def test_relative_and_absolute_reflectance_are_not_mixed(
     with pytest.raises(InputError, match="relative: all takes of a study"):
         skindb.workflow.study(db, "correlations")
     with pytest.raises(InputError, match="needs absolute reflectance"):
-        _require_one_scale(STUDIES["chromophores"], [db.record("model", "relative")])
+        _require_one_scale(
+            db, STUDIES["chromophores"], [db.record("model", "relative")]
+        )
     # one subject is too few for correlations, but its scale is not the reason
     with pytest.raises(InputError) as error:
         skindb.workflow.study(db, "correlations", takes=["relative"])
     assert "all takes of a study" not in str(error.value)
+
+
+def test_takes_of_different_exposures_are_not_mixed(
+    pictures: Path, tmp_path: Path
+) -> None:
+    db = skindb.open(str(tmp_path / "db"))
+    for name, exposure in (("short", 0.01), ("same", 0.0101), ("long", 0.02)):
+        folder = tmp_path / name
+        consent = {"scope": ["fit", "statistics"], "reference": "form"}
+        import_images(pictures, folder, {"subject": name, "consent": consent})
+        path = folder / "dome/dome.json"
+        dome = json.loads(path.read_text())
+        assert "relative_exposure" not in dome  # the pictures do not state it
+        path.write_text(json.dumps(dome | {"relative_exposure": exposure}))
+        skindb.workflow.ingest_take(db, folder, spacing_mm=8)
+        skindb.workflow.fit_take(db, name)
+    records = {name: db.record("model", name) for name in db.takes("model")}
+    study = STUDIES["correlations"]
+    _require_one_scale(db, study, [records["short"], records["same"]])
+    with pytest.raises(InputError, match=r"one exposure; found 0\.01 and 0\.02"):
+        _require_one_scale(db, study, [*records.values()])
