@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.files import cache_folder, make_private, private_file
 from skindb.threads import one_blas_thread
+from skindb.types import AnyArray
 
-Arrays = dict[str, NDArray[Any]]
+Arrays = dict[str, AnyArray]
 MAX_ENTRIES = 8  # per name; the oldest are removed
 SUMS = "sums.json"  # digests of the files of an entry
 
@@ -25,7 +25,7 @@ def cached_arrays(
     arguments: tuple[Any, ...],
     *,
     sources: tuple[str, ...],
-    make: Callable[[], Mapping[str, NDArray[Any]]],
+    make: Callable[[], Mapping[str, AnyArray]],
 ) -> Arrays:
     """Result of `make`, from the cache if available.
 

@@ -2,14 +2,15 @@
 
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 
 # SciPy has its own BLAS, and only loaded libraries can be limited
 import scipy.linalg  # noqa: F401
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
+
+from skindb.types import AnyArray
 
 P = ParamSpec("P")
 Result = TypeVar("Result")
@@ -35,7 +36,7 @@ def on_one_blas_thread(function: Callable[P, Result]) -> Callable[P, Result]:
     return limited
 
 
-def c_contiguous(array: NDArray[Any]) -> NDArray[Any]:
+def c_contiguous(array: AnyArray) -> AnyArray:
     """The array in C order and aligned; an array that was received over a network may
     be neither.
     """

@@ -6,12 +6,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+AnyArray = NDArray[Any]
 Array = NDArray[np.floating[Any]]
+Half = NDArray[np.float16]
 Float64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 Index = NDArray[np.int64]  # numbers of vertices, surfels, ...
+Index32 = NDArray[np.int32]
+Values16 = NDArray[np.uint16]  # of frames of 16 bits
 Faces = NDArray[np.integer[Any]]  # (f, 3) vertices of triangles
 
 # Arrays of compiled kernels by rank and dtype; docstrings name the lengths, such as

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 from dask.delayed import Delayed
-from numpy.typing import NDArray
 
 from skindb import plots
 from skindb.analysis.study import (
@@ -37,7 +36,7 @@ from skindb.reflectance.reduction import Systems, factor_reflectance, residuals
 from skindb.reflectance.tables import TableGrid, brdf_metric
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
-from skindb.types import Array, Float32, Index
+from skindb.types import Array, Float32, Half, Index
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -502,7 +501,7 @@ def _systems(take: xr.Dataset, tables: Array, part: slice) -> Systems:
 
 
 def _surface_rows(
-    samples: NDArray[np.float16],
+    samples: Half,
     dome: xr.Dataset,
     fitted: xr.Dataset,
     tables: Array,

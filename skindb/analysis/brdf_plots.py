@@ -4,17 +4,16 @@ al. 2005, figures 7 and 14).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb import plots
 from skindb.optics.angles import half_difference
 from skindb.reflectance.tables import lookup
 from skindb.schema import variables
-from skindb.types import Array, Float32, Mask
+from skindb.types import AnyArray, Array, Float32, Mask
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -189,7 +188,7 @@ def plot_space(space: xr.Dataset) -> Axes:
     return plot_brdf_space(space, ax=map_part.subplots())
 
 
-def sphere_radiance(tables: NDArray[Any]) -> tuple[Array, Mask]:
+def sphere_radiance(tables: AnyArray) -> tuple[Array, Mask]:
     """Radiance (pixels, pixels, groups) of spheres per irradiance of the lights
     [sr^-1], and the mask of their pixels.
 
@@ -213,7 +212,7 @@ def sphere_radiance(tables: NDArray[Any]) -> tuple[Array, Mask]:
     return radiance, inside
 
 
-def lobe(tables: NDArray[Any], incidence: float, angle: Array) -> Array:
+def lobe(tables: AnyArray, incidence: float, angle: Array) -> Array:
     """Values f cos(theta_i) [sr^-1] (angles, groups) in the plane of incidence; the
     mirror is at +incidence [rad].
     """
@@ -225,7 +224,7 @@ def lobe(tables: NDArray[Any], incidence: float, angle: Array) -> Array:
     return np.asarray(values * np.cos(incidence))
 
 
-def _shaded(tables: NDArray[Any], normal: Array, light: Array) -> Array:
+def _shaded(tables: AnyArray, normal: Array, light: Array) -> Array:
     """Values f cos(theta_i) (n, groups) for normals seen from the direction z; the BRDF
     is isotropic.
     """

@@ -3,11 +3,10 @@ sample of surfels.
 """
 
 from collections.abc import Collection, Mapping
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.analysis.regions import own_masks
 from skindb.errors import Fault, InputError, require
@@ -19,7 +18,7 @@ from skindb.schema.consent import consent_scope
 from skindb.schema.declaration import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
 from skindb.schema.label import FACE
 from skindb.schema.notes import note
-from skindb.types import Array, Index, Mask
+from skindb.types import AnyArray, Array, Index, Mask
 
 # surfels per take; the paper drew 2,000 of each subject, and 5,000 for the conditions
 # of one subject
@@ -283,7 +282,7 @@ def _weighted_mean(values: Array, errors: Array, weight: Array) -> tuple[Array, 
     return mean, error
 
 
-def _covariance(colour: Array, weight: Array) -> NDArray[Any]:
+def _covariance(colour: Array, weight: Array) -> AnyArray:
     """Area-weighted covariance (3, 3); NaN for fewer than two surfels."""
     if len(colour) < 2:
         return np.full((colour.shape[1],) * 2, np.nan)

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from dask.delayed import Delayed
-from numpy.typing import NDArray
 
 from skindb.analysis.brdf import population_basis
 from skindb.analysis.brdf_plots import plot_space
@@ -47,7 +46,7 @@ from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, store
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
 from skindb.threads import c_contiguous
-from skindb.types import Array, Mask
+from skindb.types import AnyArray, Array, Mask
 
 # subjects of a group, below which p values are approximate if the groups have different
 # variances
@@ -297,7 +296,7 @@ def _metric_and_basis(mixture: Array) -> Any:
     the components.
     """
 
-    def of(tables: NDArray[Any]) -> tuple[Array, Array]:
+    def of(tables: AnyArray) -> tuple[Array, Array]:
         weights = c_contiguous(mixture)
         return weights @ brdf_metric(tables) @ weights.T, tables @ weights.T
 

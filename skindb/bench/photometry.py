@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.bench.surface import spiral, unit
@@ -21,7 +20,7 @@ from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.mixture import basis_rows
 from skindb.reflectance.separation import surface_lobes
 from skindb.schema import dataset, label, variables
-from skindb.types import Array, Mask
+from skindb.types import Array, Mask, Values16
 from skindb.virtual.dome import Sensor
 
 ETA = 1.3
@@ -270,7 +269,7 @@ def exposures_curves(quick: bool) -> list[Curve]:
 
 
 def _one_exposure(
-    frame: NDArray[np.uint16],
+    frame: Values16,
     times: tuple[float, ...],
     record: SensorRecord,
     truth: Array,
@@ -286,7 +285,7 @@ def _one_exposure(
 
 
 def _longest_exposure(
-    frames: list[NDArray[np.uint16]], times: tuple[float, ...], sensor: Sensor
+    frames: list[Values16], times: tuple[float, ...], sensor: Sensor
 ) -> Array:
     radiance = np.full(frames[0].shape, np.nan)
     for frame, seconds in zip(frames, times, strict=True):  # from short to long

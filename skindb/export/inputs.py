@@ -40,7 +40,6 @@ MIN_SIZE = 64
 MAX_SIZE = 8192
 # of memory while maps of 30 channels are computed (measured: 190)
 BYTES_PER_TEXEL = 220
-Float = Array
 # mean free path of the walk over that of the dipole, s / sigma_tr, is this constant
 # plus this factor times R_d. Fitted to the edge of a shadow for R_d from 0.02 to 0.9
 # and an index of 1.3, within 3 %; within 20 % for an index of 1.45
@@ -153,7 +152,7 @@ def describe_edit(attrs: Mapping[Any, Any]) -> dict[str, Any] | None:
     return dict(plain(description))
 
 
-def mean_free_path(diffuse: Float, sigma_tr: Float, *, eta: float) -> Float:
+def mean_free_path(diffuse: Array, sigma_tr: Array, *, eta: float) -> Array:
     """Mean free path [mm] with which a random walk spreads light as far as the dipole
     with R_d and sigma_tr.
 
@@ -178,7 +177,7 @@ def mean_free_path(diffuse: Float, sigma_tr: Float, *, eta: float) -> Float:
     )
 
 
-def thickness(position: Float, normal: Float, triangles: NDArray[np.integer]) -> Float:
+def thickness(position: Array, normal: Array, triangles: NDArray[np.integer]) -> Array:
     """Distance [mm] (n,) from each vertex straight inwards to where the mesh ends;
     infinity where it does not.
 
@@ -202,8 +201,8 @@ def thickness(position: Float, normal: Float, triangles: NDArray[np.integer]) ->
 
 
 def transmitted_fraction(
-    distance: Float, diffuse: Float, sigma_tr: Float, *, eta: float
-) -> Float:
+    distance: Array, diffuse: Array, sigma_tr: Array, *, eta: float
+) -> Array:
     """Fraction (n, 3) of the diffuse light at a surface that comes from the other side,
     if both are lit evenly.
 

@@ -1,11 +1,9 @@
 """Texture maps of a fitted model in its texture atlas, and tangent frames as in glTF 2.0."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from skindb.export.inputs import chosen_size, mean_free_path, required
@@ -13,7 +11,7 @@ from skindb.geometry.atlas import atlas_values, push_pull, rasterise_atlas
 from skindb.reflectance.kinds import as_mixture, even_diffuse
 from skindb.render.surfels import surfel_confidence, surfel_texels, texel_codes
 from skindb.schema import VARIABLES, TexelStatus, variables
-from skindb.types import Array, Float32, Float64
+from skindb.types import AnyArray, Array, Faces, Float32, Float64, Index32
 
 Image = Float32
 MEASURED = {  # map: variable of the model; edited models have none of these
@@ -33,7 +31,6 @@ TRANSLUCENCY = {
     "the dipole with this sigma_tr",
 }
 STATUS = "; ".join(f"{int(code)} {code.explanation}" for code in TexelStatus)
-Float = Array
 
 
 @dataclass(frozen=True)
@@ -51,8 +48,8 @@ class Atlas:
     """Texture coordinates of one model, and the triangle that covers each texel."""
 
     uv: Image  # (n, 2)
-    triangles: NDArray[np.int32]  # (f, 3)
-    raster: tuple[NDArray[np.int32], Image]
+    triangles: Index32  # (f, 3)
+    raster: tuple[Index32, Image]
 
 
 def atlas_images(
@@ -126,7 +123,7 @@ def texture_maps(
     )
 
 
-def _spread(columns: NDArray[Any], trust: Float32, atlas: Atlas) -> tuple[Image, Image]:
+def _spread(columns: AnyArray, trust: Float32, atlas: Atlas) -> tuple[Image, Image]:
     """Texels (size, size, c), interpolated and filled in from the surroundings, and
     their confidence (size, size).
     """
@@ -142,8 +139,8 @@ def _spread(columns: NDArray[Any], trust: Float32, atlas: Atlas) -> tuple[Image,
 
 
 def _columns(
-    fitted: xr.Dataset, triangles: NDArray[Any]
-) -> tuple[NDArray[Any], dict[str, slice]]:
+    fitted: xr.Dataset, triangles: AnyArray
+) -> tuple[AnyArray, dict[str, slice]]:
     """Concatenated values (n, c) that every trusted surfel has, and the columns of each
     variable.
     """
@@ -182,7 +179,7 @@ def _translucency(
     path = mean_free_path(
         diffuse, sigma_tr, eta=float(fitted[variables.REFRACTIVE_INDEX])
     ).astype(np.float32)
-    values: dict[str, NDArray[Any]] = {
+    values: dict[str, AnyArray] = {
         "translucency": 1 / sigma_tr,
         "mean_free_path": path,
     }
@@ -230,7 +227,7 @@ def _measured(
 
 
 def _spread_known(
-    parts: dict[str, NDArray[Any]], trust: Float32, atlas: Atlas
+    parts: dict[str, AnyArray], trust: Float32, atlas: Atlas
 ) -> dict[str, Image]:
     """Texels (size, size, c) by name of values (n, c), each from the trusted surfels
     where it is finite.
@@ -254,7 +251,7 @@ def _spread_known(
     return {name: images[name] for name in parts if name in images}
 
 
-def _single_channel(values: NDArray[Any], doc: str) -> TextureMap:
+def _single_channel(values: AnyArray, doc: str) -> TextureMap:
     return TextureMap(values.astype(np.float32)[..., None], ("Y",), "1", doc)
 
 
@@ -292,7 +289,7 @@ def _fitted_maps(image: Image, layout: dict[str, slice]) -> dict[str, TextureMap
 
 
 def tangent_frames(
-    position: Float, normal: Float, uv: Float, triangles: NDArray[np.integer[Any]]
+    position: Array, normal: Array, uv: Array, triangles: Faces
 ) -> Float64:
     """Tangents (n, 4) of vertices: unit vectors in the direction of increasing u, and
     the sign of the bitangent.
@@ -340,7 +337,7 @@ def tangent_frames(
     return np.concatenate([tangent, sign[:, None]], axis=1)
 
 
-def to_tangent_space(direction: Float, normal: Float, tangent: Float) -> Float64:
+def to_tangent_space(direction: Array, normal: Array, tangent: Array) -> Float64:
     """Coordinates (n, 3) of directions along tangent, bitangent and normal, see
     `tangent_frames`.
     """
@@ -354,7 +351,7 @@ def to_tangent_space(direction: Float, normal: Float, tangent: Float) -> Float64
     )
 
 
-def _any_perpendicular(normal: Float) -> Float64:
+def _any_perpendicular(normal: Array) -> Float64:
     axis = np.where(np.abs(normal[:, :1]) < 0.9, [[1.0, 0, 0]], [[0.0, 1, 0]])
     tangent = np.cross(normal, axis)
     return np.asarray(tangent / np.linalg.norm(tangent, axis=1, keepdims=True))

@@ -5,12 +5,10 @@ error of the approximation.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 import imagecodecs
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from skindb.export.inputs import chosen_size, required, thickness, transmitted_fraction
@@ -22,9 +20,8 @@ from skindb.reflectance.tables import kernel_tables, lookup
 from skindb.render.image import encode_srgb
 from skindb.render.surfels import surfel_confidence
 from skindb.schema import variables
-from skindb.types import Array, Bytes, Float32, Float64, Index
+from skindb.types import AnyArray, Array, Bytes, Float32, Float64, Index
 
-Float = Array
 # values of perceptual roughness that are tried for each point
 ROUGHNESS = np.linspace(0.1, 1.0, 46)
 # of fitting lobe and base colour in turn; after the third, the error changes by less
@@ -43,10 +40,10 @@ MIN_TRANSMITTED = 0.01
 class Material:
     """Parameters of the glTF material with KHR_materials_specular at points."""
 
-    base_color: Float  # (n, 3) linear, 0 to 1
-    specular: Float  # (n,) factor on all reflection, 0 to 1
-    f0: Float  # (n,) reflectance at normal incidence, before that factor
-    roughness: Float  # (n,) perceptual; alpha is its square
+    base_color: Array  # (n, 3) linear, 0 to 1
+    specular: Array  # (n,) factor on all reflection, 0 to 1
+    f0: Array  # (n,) reflectance at normal incidence, before that factor
+    roughness: Array  # (n,) perceptual; alpha is its square
 
 
 @dataclass(frozen=True)
@@ -55,16 +52,16 @@ class _Pairs:
     coordinates of the tables.
     """
 
-    angles: tuple[Float, Float, Float]
-    cos_i: Float
-    cos_o: Float
-    cos_h: Float
-    cos_d: Float
-    weight: Float  # solid angles of light and camera times cos_o, as in a picture
+    angles: tuple[Array, Array, Array]
+    cos_i: Array
+    cos_o: Array
+    cos_h: Array
+    cos_d: Array
+    weight: Array  # solid angles of light and camera times cos_o, as in a picture
 
 
 def fit_material(
-    tables: Float32, diffuse: Float, weights: Float, *, eta: float
+    tables: Float32, diffuse: Array, weights: Array, *, eta: float
 ) -> Material:
     """Fit the material whose pictures differ least from those of the model, separately
     at each point.
@@ -95,10 +92,10 @@ def fit_material(
     amounts = np.stack(
         [np.concatenate([diffuse[:, [c]], weights], axis=1) for c in range(3)]
     ).astype(float)
-    base: Float = np.asarray(diffuse, float)
-    low: Float
-    high: Float
-    roughness: Float
+    base: Array = np.asarray(diffuse, float)
+    low: Array
+    high: Array
+    roughness: Array
     low = high = np.zeros(len(base))
     roughness = np.full(len(base), 0.5)
     for _ in range(ROUNDS):
@@ -110,8 +107,8 @@ def fit_material(
 
 
 def _fit_lobe(
-    pairs: _Pairs, parts: Float, amounts: Float, base: Float
-) -> tuple[Float, Float, Float]:
+    pairs: _Pairs, parts: Array, amounts: Array, base: Array
+) -> tuple[Array, Array, Array]:
     """a, b and roughness (n,) for base colours (n, 3), where the model is `amounts` (3,
     n, m) of `parts` (pairs, m).
     """
@@ -155,7 +152,7 @@ def _fit_lobe(
     return parameters[:, 0], parameters[:, 1], parameters[:, 2]
 
 
-def _best_pair(gram: Float, rhs: Float) -> tuple[Float, Float]:
+def _best_pair(gram: Array, rhs: Array) -> tuple[Array, Array]:
     """Pairs x >= 0 (n, 2) that minimise x G x - 2 x r, and the decrease (n,).
 
     The constraints are that the sum of x is at most 1, and f0 at most MAX_F0.
@@ -196,12 +193,12 @@ def _best_pair(gram: Float, rhs: Float) -> tuple[Float, Float]:
 
 def _fit_base(
     pairs: _Pairs,
-    parts: Float,
-    amounts: Float,
-    low: Float,
-    high: Float,
-    roughness: Float,
-) -> Float:
+    parts: Array,
+    amounts: Array,
+    low: Array,
+    high: Array,
+    roughness: Array,
+) -> Array:
     """Base colours (n, 3), from 0 to 1, for given lobes (n,)."""
     use = pairs.weight * pairs.cos_i**2
     rise = (1 - pairs.cos_d) ** 5
@@ -234,8 +231,8 @@ def _fit_base(
 
 def approximation_error(
     tables: Float32,
-    diffuse: Float,
-    weights: Float,
+    diffuse: Array,
+    weights: Array,
     values: Material,
     *,
     eta: float,
@@ -285,8 +282,8 @@ def approximation_error(
 
 
 def gltf_brdf(
-    values: Material, cos_i: Float, cos_o: Float, cos_h: Float, cos_d: Float
-) -> Float:
+    values: Material, cos_i: Array, cos_o: Array, cos_h: Array, cos_d: Array
+) -> Array:
     """BRDF (n, directions, 3) of the material, by the equations of glTF 2.0, appendix
     B, and KHR_materials_specular.
 
@@ -308,7 +305,7 @@ def gltf_brdf(
     )
 
 
-def _relative(ours: Float, theirs: Float, weight: Float) -> float:
+def _relative(ours: Array, theirs: Array, weight: Array) -> float:
     off, all_of_it = (
         (weight[:, None] * values**2).sum() for values in (ours - theirs, ours)
     )
@@ -335,7 +332,7 @@ def _pairs() -> _Pairs:
     return _Pairs((h, d, p), cos_i, cos_o, np.cos(h), np.cos(d), weight)
 
 
-def _ggx(a2: Float, cos_i: Float, cos_o: Float, cos_h: Float) -> Float:
+def _ggx(a2: Array, cos_i: Array, cos_o: Array, cos_h: Array) -> Array:
     """GGX distribution with Smith's separable masking, divided by 4 cos_i cos_o (glTF
     2.0, appendix B).
     """
@@ -435,8 +432,8 @@ def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
 
 def _errors(
     tables: Float32,
-    diffuse: NDArray[Any],
-    weights: NDArray[Any],
+    diffuse: AnyArray,
+    weights: AnyArray,
     materials: tuple[Material, ...],
     *,
     eta: float,
@@ -464,10 +461,10 @@ class Shape:
     shading: Float64  # (n, 3) as fitted
     tangent: Float64  # (n, 4)
     uv: Float32  # (n, 2)
-    triangles: NDArray[Any]
+    triangles: AnyArray
 
 
-def _shape(fitted: xr.Dataset, triangles: NDArray[Any]) -> Shape:
+def _shape(fitted: xr.Dataset, triangles: AnyArray) -> Shape:
     place = fitted[variables.SURFEL_POSITION].values
     uv = fitted[variables.SURFEL_UV].values.astype(np.float32)
     normal, shading = (
@@ -552,7 +549,7 @@ def _textures(values: dict[str, Float32]) -> dict[str, Bytes]:
     return pictures
 
 
-def _eight_bits(values: NDArray[Any]) -> Bytes:
+def _eight_bits(values: AnyArray) -> Bytes:
     return np.asarray(np.round(np.clip(values, 0, 1) * 255), np.uint8)
 
 

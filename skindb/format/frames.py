@@ -25,7 +25,6 @@ import Imath
 import numpy as np
 import OpenEXR
 import tifffile
-from numpy.typing import NDArray
 
 from skindb.elementwise import thread_count
 from skindb.errors import Fault, InputError, attempt, input_error, require
@@ -40,9 +39,9 @@ from skindb.limits import (
     MAX_RECHECKED_BYTES,
 )
 from skindb.render.image import write_exr
-from skindb.types import Index
+from skindb.types import AnyArray, Index, Values16
 
-Frame = NDArray[Any]  # (h, w, 3) uint8, uint16, float16 or float32
+Frame = AnyArray  # (h, w, 3) uint8, uint16, float16 or float32
 Header = tuple[int, int, int, np.dtype[Any]]  # width, height, channels, type
 Codec = tuple[Callable[[BinaryIO], Header], Callable[[Path, bytes], Frame]]
 Digests = dict[Path, str]  # sha256 of the bytes that were decoded
@@ -486,7 +485,7 @@ def _decode_exr(path: Path, content: bytes) -> Frame:
     return out.view(np.float16)
 
 
-def _unpack(block: bytes, order: Index, buffer: NDArray[np.uint16], out: Frame) -> bool:
+def _unpack(block: bytes, order: Index, buffer: Values16, out: Frame) -> bool:
     """Write the bits (lines, w, 3) of a zipped block of half floats, whose channels in
     this order are R, G, B; False if it is damaged.
 

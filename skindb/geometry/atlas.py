@@ -8,11 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
 from skindb.errors import Fault, InputError
@@ -32,7 +30,17 @@ from skindb.geometry.mesh import (
     outline_first,
     side_lengths,
 )
-from skindb.types import Array, Faces, Float64, Index, Mask, float64
+from skindb.types import (
+    AnyArray,
+    Array,
+    Faces,
+    Float32,
+    Float64,
+    Index,
+    Index32,
+    Mask,
+    float64,
+)
 
 EQUALISATION_ROUNDS = 9  # of area equalisation
 # exponent of the squared stretch: the published 0.5 needs 13 rounds for the result of 8
@@ -52,12 +60,12 @@ TRIANGLES_PER_BLOCK = 1 << 17  # takes 50 MB
 # relative to the summed products: the sign of a larger difference is correct (Shewchuk
 # 1997)
 CERTAIN = 3.4e-16
-Image = NDArray[np.float32]
+Image = Float32
 
 
 def disc_atlas(
     vertices: Array, faces: Faces, *, finer: tuple[sp.csr_matrix, Faces] | None = None
-) -> tuple[NDArray[np.float32], dict[str, float]]:
+) -> tuple[Float32, dict[str, float]]:
     """Map a surface with at least one boundary into the unit square.
 
     The longest boundary is mapped to a circle by arc length, and every other vertex to
@@ -412,7 +420,7 @@ def symmetric_dirichlet(largest: Array, smallest: Array, area: Array) -> float:
 
 def distortion(
     vertices: Array, faces: Faces, uv: Array, member: Mask
-) -> dict[str, NDArray[Any]]:
+) -> dict[str, AnyArray]:
     """Distortion of an atlas, for the entire surface and by region.
 
     Parameters
@@ -453,9 +461,7 @@ def _summary(
     return area_log2_sd(largest, smallest, area), float(median), float(high)
 
 
-def rasterise_atlas(
-    uv: Array, faces: Faces, size: int
-) -> tuple[NDArray[np.int32], Image]:
+def rasterise_atlas(uv: Array, faces: Faces, size: int) -> tuple[Index32, Image]:
     """Triangle and position at every texel centre of a square map.
 
     Parameters
@@ -485,7 +491,7 @@ def atlas_values(
     trust: Array,
     uv: Array,
     faces: Faces,
-    raster: tuple[NDArray[np.int32], Image],
+    raster: tuple[Index32, Image],
 ) -> tuple[Image, Image]:
     """Values of the vertices at the texels of a map.
 
@@ -530,7 +536,7 @@ def _doubles(x: Array) -> Float64:
     return np.ascontiguousarray(x, np.float64)
 
 
-def _indices(faces: Faces) -> NDArray[np.int32]:
+def _indices(faces: Faces) -> Index32:
     return np.ascontiguousarray(faces, np.int32)
 
 

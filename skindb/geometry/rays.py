@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from numpy.typing import NDArray
 
 from skindb.geometry._ray_kernels import aim
-from skindb.types import Array, Faces, Float64, Index, Mask, float64
+from skindb.types import Array, Faces, Float32, Float64, Index, Index32, Mask, float64
 
 RAYS_PER_BLOCK = 1 << 15  # so that the arrays of the rays stay in the cache
 NUDGE = 1e-3 * np.array([0.62, 0.55, -0.56])  # mm
@@ -94,7 +93,7 @@ class RayScene:
 
     def first_hit(
         self, origin: Array, direction: Array
-    ) -> tuple[NDArray[np.int32], Float64, Float64]:
+    ) -> tuple[Index32, Float64, Float64]:
         """First triangle along rays, from either side.
 
         Parameters
@@ -129,7 +128,7 @@ class RayScene:
             barycentric[i + hit], distance[i + hit] = refined
         return face, barycentric, distance
 
-    def distances(self, origin: Array, direction: Array) -> NDArray[np.float32]:
+    def distances(self, origin: Array, direction: Array) -> Float32:
         """Distances (n,) in mm from one origin (3,) to the first triangle along unit
         directions (n, 3).
 
@@ -147,7 +146,7 @@ class RayScene:
         distance[~(distance < NO_HIT_DISTANCE_MM)] = np.inf
         return distance
 
-    def _first(self, start: Array, way: Array) -> NDArray[np.int32]:
+    def _first(self, start: Array, way: Array) -> Index32:
         face = self._run("INTERSECT", start, way)
         # one in a hundred rays that aim exactly at a vertex misses the mesh: misses are
         # repeated with a small shift
@@ -160,8 +159,8 @@ class RayScene:
         query: str,
         start: Array,
         way: Array,
-        reach: NDArray[np.float32] | None = None,
-    ) -> NDArray[np.int32]:
+        reach: Float32 | None = None,
+    ) -> Index32:
         if len(start) == 0:
             return np.zeros(0, np.int32)
         length = np.full(len(start), 1e37, np.float32) if reach is None else reach

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from trimesh.exchange.ply import load_ply
 
@@ -24,7 +23,7 @@ from skindb.limits import (
     MAX_SCAN_HEADER_BYTES,
     MAX_SCAN_VERTICES,
 )
-from skindb.types import Array, Faces, Float64, Index, Mask, float64
+from skindb.types import Array, Bytes, Faces, Float64, Index, Mask, float64
 
 MAX_COLOUR = 255  # of the eight bits of a colour of a vertex
 CURE = "export the scan again as a triangle mesh in mm (PLY or OBJ)"
@@ -100,7 +99,7 @@ def read_scan(path: str | Path) -> Scan:
     return Scan(vertices, faces)
 
 
-def read_colours(path: str | Path, count: int) -> NDArray[np.uint8] | None:
+def read_colours(path: str | Path, count: int) -> Bytes | None:
     """Colours (count, 3) of the vertices of a PLY file that `read_scan` has read; None
     where it has none of 8 bits.
     """

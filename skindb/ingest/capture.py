@@ -13,7 +13,6 @@ from typing import Any
 import dask
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.calibration.frame_checks import (
     dark_faults,
@@ -80,7 +79,7 @@ from skindb.ingest.surfels import (
     site_positions,
 )
 from skindb.parameters import IngestParameters
-from skindb.types import Float64, Progress, silent
+from skindb.types import Float64, Half, Progress, silent
 
 # with two, one reads while the other computes
 MIN_THREADS = 2
@@ -423,7 +422,7 @@ class _DomeStages:
         self,
         lumitexels: Lumitexels,
         check: CalibrationCheck,
-        visible: NDArray[np.float16],
+        visible: Half,
         rotations: Float64,
     ) -> dict[str, xr.Dataset]:
         dome = self.dome

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.calibration.irradiance import light_falloff
 from skindb.format.dome import CameraRecord, DomeRecord
@@ -30,7 +29,7 @@ from skindb.ingest.photo_offsets import (
 )
 from skindb.ingest.surfels import SurfelSet
 from skindb.numerics.statistics import correlation
-from skindb.types import Float64, Index, Mask
+from skindb.types import Float32, Float64, Half, Index, Mask
 
 Pair = tuple[int, int]  # light, camera
 LIGHTS_PER_CAMERA = 3  # those that illuminate the largest part of what the camera sees
@@ -97,9 +96,9 @@ class CalibrationCheck:
 
     dome: DomeRecord
     surfels: SurfelSet
-    light_visible: NDArray[np.float16]
+    light_visible: Half
     clear: Mask
-    pixels: NDArray[np.float32]
+    pixels: Float32
     intensity: Float64
 
     @cached_property
@@ -138,11 +137,11 @@ class CalibrationCheck:
             rows.append(lit * falloff / square * self.intensity[j].mean())
         return np.array(rows)
 
-    def reduce(self, camera: int, radiance: NDArray[np.float32]) -> NDArray[np.float32]:
+    def reduce(self, camera: int, radiance: Float32) -> Float32:
         """Downsampled picture (h, w, 3) of a view."""
         return reduced(radiance, self.factor(camera))
 
-    def evaluate(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> Calibration:
+    def evaluate(self, pictures: Mapping[Pair, Float32]) -> Calibration:
         """Compare the downsampled pictures of `pairs` with the predictions."""
         views = self.views(pictures)
         offsets, albedo = self._offsets(views)
@@ -191,7 +190,7 @@ class CalibrationCheck:
     def _brightness(
         self,
         views: Sequence[ReducedView],
-        pictures: Mapping[Pair, NDArray[np.float32]],
+        pictures: Mapping[Pair, Float32],
         offsets: Mapping[int, Offset],
         albedo: Float64,
     ) -> Brightness:
@@ -252,7 +251,7 @@ class CalibrationCheck:
         pixels = self.pixels[self.compared, camera].astype(np.float64)
         return pixels / self.factor(camera)
 
-    def views(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> list[ReducedView]:
+    def views(self, pictures: Mapping[Pair, Float32]) -> list[ReducedView]:
         """Views with enough surfels of varying irradiance that are not black, as they
         are when a lamp fails.
         """

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.calibration.radiance import Image
 from skindb.format.contact_probe import ProbeRecord
@@ -20,7 +19,7 @@ from skindb.ingest.probe_profiles import Profiles
 from skindb.ingest.surfels import SurfelSet, transferred_landmarks
 from skindb.parameters import SCAN_ERROR_DEGREES
 from skindb.schema import dataset
-from skindb.types import Float64
+from skindb.types import Float64, Half
 
 CHANNELS = {"channel": ["R", "G", "B"]}  # coordinate
 # of the spool
@@ -30,8 +29,8 @@ COUNTS = ("sample_count", "saturated_count", "dark_count", "single_exposure_coun
 def surfel_group(
     surfels: SurfelSet,
     dome: DomeRecord | None = None,
-    light_fraction: NDArray[np.float16] | None = None,
-    camera_fraction: NDArray[np.float16] | None = None,
+    light_fraction: Half | None = None,
+    camera_fraction: Half | None = None,
     *,
     scan_error: float = SCAN_ERROR_DEGREES,
 ) -> xr.Dataset:

@@ -10,7 +10,6 @@ from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.calibration._merge_kernels import OK, SATURATED
 from skindb.calibration.frame_checks import SensorPatterns, highest_value, view_faults
@@ -43,7 +42,18 @@ from skindb.ingest.faults import (
 )
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet
-from skindb.types import Float64, Index, Mask, Progress, silent
+from skindb.types import (
+    Bytes,
+    Float32,
+    Float64,
+    Half,
+    Index,
+    Index32,
+    Mask,
+    Progress,
+    Values16,
+    silent,
+)
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -64,7 +74,7 @@ class CameraSampling(NamedTuple):
     """Where and how one camera samples the surfels, the same under every light."""
 
     surfels: Mask  # (n,) those that it samples
-    pixels: NDArray[np.float32]  # (n, 2)
+    pixels: Float32  # (n, 2)
 
 
 @dataclass(frozen=True)
@@ -95,7 +105,7 @@ class Lumitexels:
 
     sample: Any  # (n, light, camera, 3) float16 sr^-1; lazy
     # (4, n) usable, saturated, dark, and usable from a single exposure
-    counts: NDArray[np.int32]
+    counts: Index32
     view_count: Index  # (light, camera) samples of each view
     views: ViewLevels
     noise_floor: float  # sr^-1
@@ -107,7 +117,7 @@ class Lumitexels:
 
 def fully_lit(
     surfels: SurfelSet,
-    light_fraction: NDArray[np.float16],
+    light_fraction: Half,
     cameras: Sequence[CameraRecord],
 ) -> Mask:
     """Where (n, light) the entire disc is visible from a surfel and from all neighbours
@@ -168,7 +178,7 @@ class Sampler:
         cameras = range(len(self.check.dome.cameras))
         self._shots = list(self.pool.map(self._camera_sampling, cameras))
 
-    def pictures(self, pairs: Collection[Pair]) -> dict[Pair, NDArray[np.float32]]:
+    def pictures(self, pairs: Collection[Pair]) -> dict[Pair, Float32]:
         """Downsampled photographs of these views, which are sampled unless they are in
         the spool, also of an interrupted run.
         """
@@ -299,7 +309,7 @@ class Sampler:
 
     def _gathered(
         self, merged: MergedView, shot: CameraSampling, surfels: Mask, j: int
-    ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
+    ) -> tuple[Values16, Bytes]:
         """Bits of the samples (3, n) of a view, and outcome (n,) for each surfel."""
         check = self.check
         light = check.dome.lights[j]
@@ -428,11 +438,11 @@ class SampleNoise:
     read_variance: Float64  # (camera, 3, exposure) radiance^2
     shot_variance: Float64  # (camera, 3, exposure) radiance
     # (n, camera); NaN where the camera takes no sample
-    effective_pixels: NDArray[np.float32]
+    effective_pixels: Float32
 
 
 def sample_noise(
-    dome: DomeRecord, pixels: NDArray[np.float32], effective_pixels: NDArray[np.float32]
+    dome: DomeRecord, pixels: Float32, effective_pixels: Float32
 ) -> SampleNoise | None:
     """The noise of all samples from the sensors' electrons; None if those of a camera are unknown.
 
@@ -458,7 +468,7 @@ def sample_noise(
     return SampleNoise(limit, read, shot, effective_pixels)
 
 
-def _mean_gain(camera: CameraRecord, pixels: NDArray[np.float32]) -> float:
+def _mean_gain(camera: CameraRecord, pixels: Float32) -> float:
     """Mean vignette at projections (n, 2)."""
     if not camera.vignette.any() or not len(pixels):
         return 1.0

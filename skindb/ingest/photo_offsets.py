@@ -10,10 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from skindb.ingest._sample_kernels import (
@@ -24,7 +22,7 @@ from skindb.ingest._sample_kernels import (
     shift_moments,
 )
 from skindb.numerics.statistics import correlation, robust_deviation
-from skindb.types import Float64, Mask
+from skindb.types import Array, Float32, Float64, Mask
 
 PIXEL_MM = 2.0  # mm; about the width of an eyelid, well below the offsets to be found
 SMOOTHING_PX = 0.7  # px of the downsampled picture; makes its derivatives smooth
@@ -97,7 +95,7 @@ def reduction(width_mm: float) -> int:
     return max(int(PIXEL_MM / width_mm), 1)
 
 
-def reduced(image: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
+def reduced(image: Float32, factor: int) -> Float32:
     """Means (h // factor, w // factor, c) of square blocks of a picture (h, w, c),
     whose NaN count as its maximum.
     """
@@ -249,7 +247,7 @@ def nan_quantile(values: Float64, level: float) -> Float64:
     return np.asarray(np.where(part < 0.5, low + step * part, high - step * (1 - part)))
 
 
-def square_root_image(image: NDArray[np.floating[Any]]) -> Float64:
+def square_root_image(image: Array) -> Float64:
     """Square roots of a picture, slightly smoothed so that its derivatives are smooth."""
     smooth = gaussian_filter(np.asarray(image, np.float64), SMOOTHING_PX)
     return np.asarray(np.sqrt(np.maximum(smooth, 0)))
@@ -296,7 +294,7 @@ class Brightness:
 
 def view_factors(
     view: ReducedView,
-    picture: NDArray[np.float32],
+    picture: Float32,
     pixels: Float64,
     irradiance: Float64,
     albedo: Float64,

@@ -21,7 +21,6 @@ from typing import Any
 import imagecodecs
 import numpy as np
 import tifffile
-from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps
 from scipy.spatial.transform import Rotation
 
@@ -41,9 +40,9 @@ from skindb.limits import (
     MAX_SCAN_BYTES,
 )
 from skindb.parameters import ImportParameters
-from skindb.types import Float64, Mask, Progress, silent
+from skindb.types import AnyArray, Float64, Mask, Progress, silent
 
-Picture = NDArray[Any]  # (h, w, 3) uint8, uint16, or float radiance
+Picture = AnyArray  # (h, w, 3) uint8, uint16, or float radiance
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".exr")
 FORMATS = "PNG, TIFF, JPEG, BMP or OpenEXR"
 CAMERA = "c00"

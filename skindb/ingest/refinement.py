@@ -9,7 +9,6 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skindb.format.dome import CameraRecord, DomeRecord
@@ -21,7 +20,7 @@ from skindb.ingest.consistency import (
     Pair,
 )
 from skindb.ingest.photo_offsets import Offset, ReducedView, bilinear
-from skindb.types import Float64
+from skindb.types import Float32, Float64
 
 ROUNDS = 2  # a third round shifted the photographs of four captures by at most 0.06 mm
 SMALL_TURN = 1e-4  # rad; step of the finite differences
@@ -99,7 +98,7 @@ def pictures_to_judge(
 
 def choose_refinement(
     check: CalibrationCheck,
-    pictures: Mapping[Pair, NDArray[np.float32]],
+    pictures: Mapping[Pair, Float32],
     held_out: frozenset[int],
 ) -> tuple[DomeRecord, str]:
     """Refine the cameras, and keep this if photographs under held-out lights agree better.

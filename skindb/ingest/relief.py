@@ -9,7 +9,6 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
 
@@ -20,7 +19,7 @@ from skindb.errors import attempt_all, require
 from skindb.format.dome import CameraRecord, DomeRecord, LightRecord
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.geometry.scan import Scan
-from skindb.types import Float64, Index, Mask
+from skindb.types import Float32, Float64, Half, Index, Mask
 
 # error of the normals for which their prior has no effect [degree]
 NO_SCAN_DEGREES = 60.0
@@ -57,9 +56,7 @@ class Relief:
     lit: Mask  # (light, rows, columns) of the grid
     step: int  # pixels between the points of the grid
 
-    def light_fraction(
-        self, camera: CameraRecord, position: Float64
-    ) -> NDArray[np.float16]:
+    def light_fraction(self, camera: CameraRecord, position: Float64) -> Half:
         """Whether each surfel (n, light) at `position` (n, 3) is lit: 1 or 0."""
         column, row = np.floor(camera.project(position) / self.step).astype(int).T
         _, rows, columns = self.lit.shape
@@ -133,7 +130,7 @@ def estimate_relief(
 
 def _grey_pictures(
     dome: DomeRecord, merger: FrameMerger, pool: Executor, spacing_mm: float
-) -> tuple[NDArray[np.float32], int]:
+) -> tuple[Float32, int]:
     """Mean radiance (light, rows, columns) of the squares of a grid, over the intensity
     of the light; NaN where pixels are saturated. The width of the squares in pixels.
     """
@@ -144,7 +141,7 @@ def _grey_pictures(
     step = min(step, camera.width // 2 or 1, camera.height // 2 or 1)
     rows, columns = camera.height // step, camera.width // step
 
-    def picture(light: LightRecord) -> NDArray[np.float32]:
+    def picture(light: LightRecord) -> Float32:
         radiance, flag = merger.merge(read_view(dome, light.id, camera))
         radiance[flag == SATURATED] = np.nan
         grey = radiance.mean(axis=-1)[: rows * step, : columns * step]
@@ -155,7 +152,7 @@ def _grey_pictures(
     return np.stack(attempt_all([], picture, dome.lights, pool=pool)), step
 
 
-def _lit(values: NDArray[np.float32]) -> Mask:
+def _lit(values: Float32) -> Mask:
     """Where (light, rows, columns) a picture shows light, neither shadow nor saturation."""
     low, bright = np.quantile(
         np.nan_to_num(values), (1 - BRIGHT_QUANTILE, BRIGHT_QUANTILE), axis=0
@@ -178,7 +175,7 @@ def _near(dome: DomeRecord, distance: float, rays: Float64) -> bool:
 
 
 def photometric_normals(
-    values: NDArray[np.float32],
+    values: Float32,
     lit: Mask,
     lights: tuple[LightRecord, ...],
     points: Float64,

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb import __version__
 from skindb.errors import require
@@ -23,6 +22,7 @@ from skindb.format.folder import WHOLE_SURFACE, Capture
 from skindb.format.frames import Digests
 from skindb.ingest.lumitexels import Lumitexels
 from skindb.ingest.surfels import SurfelSet
+from skindb.types import Index32
 
 FRAMES = "frames"  # name of the digest over all frames
 QUANTILES = {"p5": 0.05, "p50": 0.5, "p95": 0.95, "max": 1.0}
@@ -257,7 +257,7 @@ def sample_table(samples: Mapping[str, Any]) -> list[list[Any]]:
     return [["samples of", *COLUMNS], *rows]
 
 
-def _quantiles(count: NDArray[np.int32]) -> dict[str, float]:
+def _quantiles(count: Index32) -> dict[str, float]:
     sampled = count[count > 0]
     if not len(sampled):
         return dict.fromkeys(COLUMNS, 0)

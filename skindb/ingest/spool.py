@@ -22,13 +22,13 @@ from typing import Any, Self
 
 import dask.array as da
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.files import PRIVATE_FILE, make_private, private_file
 from skindb.ingest._sample_kernels import tally
 from skindb.limits import RESUMABLE_SECONDS
 from skindb.schema.label import BLOCK_SURFELS
+from skindb.types import AnyArray, Bytes, Half, Values16
 
 # between two entries of the journal: the most that a killed run loses
 JOURNAL_INTERVAL_SECONDS = 5.0
@@ -125,8 +125,8 @@ class Spool:
         self,
         light: int,
         camera: int,
-        samples: NDArray[np.uint16],
-        outcome: NDArray[np.uint8],
+        samples: Values16,
+        outcome: Bytes,
         digests: Mapping[str, str],
     ) -> None:
         """Keep a view: (3, n) bits of half floats, the outcome for each surfel, and the
@@ -141,13 +141,13 @@ class Spool:
         if due and self.resumable:
             self.checkpoint()
 
-    def keep(self, name: str, array: NDArray[Any]) -> None:
+    def keep(self, name: str, array: AnyArray) -> None:
         """Keep a small array beside the samples; the file is written atomically."""
         content = io.BytesIO()
         np.save(content, array)
         self._replace(f"{name}.npy", content.getbuffer())
 
-    def kept(self, name: str) -> NDArray[Any] | None:
+    def kept(self, name: str) -> AnyArray | None:
         """An array of `keep`, possibly of an earlier run; None if it is absent."""
         content = self._sealed(f"{name}.npy")
         return None if content is None else np.load(content)
@@ -184,7 +184,7 @@ class Spool:
             min(BLOCK_SURFELS, n - start) for start in range(0, n, BLOCK_SURFELS)
         )
 
-        def shard(block_info: Any = None) -> NDArray[np.float16]:
+        def shard(block_info: Any = None) -> Half:
             (begin, end), *_ = block_info[None]["array-location"]
             return self._read(begin, end)
 
@@ -196,7 +196,7 @@ class Spool:
         )
         return lazy
 
-    def _write(self, light: int, camera: int, samples: NDArray[np.uint16]) -> None:
+    def _write(self, light: int, camera: int, samples: Values16) -> None:
         content = np.ascontiguousarray(samples).data.cast("B")
         offset = (light * self.shape[1] + camera) * len(content)
         while content:  # a large write may be partial
@@ -204,7 +204,7 @@ class Spool:
             content = content[count:]
             offset = offset + count
 
-    def _read(self, begin: int, end: int) -> NDArray[np.float16]:
+    def _read(self, begin: int, end: int) -> Half:
         """Samples (surfel, light, camera, 3)."""
         lights, cameras, n = self.shape
         rows = np.empty((lights * cameras * 3, end - begin), np.float16)

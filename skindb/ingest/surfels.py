@@ -30,7 +30,7 @@ from skindb.geometry.mesh import (
     vertex_normals,
 )
 from skindb.geometry.rays import RayScene
-from skindb.types import Float64, Index, Mask
+from skindb.types import Float32, Float64, Index, Mask
 
 MAX_SURFELS = 2_500_000  # the samples of this many surfels in a full dome take 36 GB
 # mm; a landmark that is farther from the cropped than from the complete scan by this
@@ -58,7 +58,7 @@ class SurfelSet:
     position: Float64  # (n, 3) mm
     normal: Float64  # (n, 3)
     area: Float64  # (n,) mm2
-    uv: NDArray[np.float32]  # (n, 2)
+    uv: Float32  # (n, 2)
     faces: Index  # (f, 3)
     region_names: tuple[str, ...]
     region: Mask  # (n, region)
@@ -115,7 +115,7 @@ def build_surfels(
     )
 
 
-def _planar_uv(vertices: Float64) -> NDArray[np.float32]:
+def _planar_uv(vertices: Float64) -> Float32:
     """Texture coordinates (n, 2) by x and y, v = 0 at the top; equal scales in both."""
     low = vertices[:, :2].min(axis=0)
     size = float(np.ptp(vertices[:, :2], axis=0).max()) or 1.0
@@ -330,7 +330,7 @@ def camera_visibility(
     cameras: Sequence[CameraRecord],
     scene: RayScene,
     pool: Executor,
-) -> tuple[Half, Mask, NDArray[np.float32]]:
+) -> tuple[Half, Mask, Float32]:
     """Visibility of the surfels in each camera.
 
     Returns
@@ -381,7 +381,7 @@ def _in_picture(surfels: SurfelSet, camera: CameraRecord) -> tuple[Float64, Mask
 
 def depth_map(
     camera: CameraRecord, scene: RayScene, near: Float64
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[Float32, Float32]:
     """Distance (h, w) mm of the surface along the rays (h, w, 3) through the centres of
     the pixels within EDGE_PX of positions (n, 2); infinity outside the surface.
     """

@@ -17,13 +17,12 @@ from math import factorial, prod
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from skindb.numerics.statistics import CONFIDENCE, ROUNDING
-from skindb.types import Array, Index, Mask, float64
+from skindb.types import AnyArray, Array, Index, Mask, float64
 
-Draw = NDArray[Any]  # an order, signs or labels of the subjects, or many of them
+Draw = AnyArray  # an order, signs or labels of the subjects, or many of them
 SUMS = 8  # values in memory per draw and quantity, or subject
 TILE = 1 << 14  # quantities of which double-precision copies are in memory at a time
 # relative to the sum of weighted squares; smaller differences are dominated by rounding

@@ -1,10 +1,10 @@
 """Non-negative least squares with a certificate, in batches (Weyrich et al. 2005, eq. 8)."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from skindb.numerics import _nnls_kernels
-from skindb.types import Array, Mask
+from skindb.types import Array, Index32, Mask
 
 # largest KKT residual, relative to max |M'r| after scaling columns to unit length
 TOLERANCE = 1e-10
@@ -15,7 +15,7 @@ def solve_nnls(
     rhs: ArrayLike,
     *,
     warm: ArrayLike | None = None,
-) -> tuple[Array, Array, NDArray[np.int32], Mask]:
+) -> tuple[Array, Array, Index32, Mask]:
     """Minimise |M x - r| over x >= 0 given M'M and M'r.
 
     Parameters

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize, stats
 
-from skindb.types import Array, float64
+from skindb.types import AnyArray, Array, float64
 
 CONFIDENCE = 0.95  # of intervals
 POWER = 0.8  # of tests, for the smallest effect that they detect
@@ -135,9 +134,7 @@ def detectable_difference(error: Array, free: Array | float) -> Array:
     return error * quantiles
 
 
-def variance_components(
-    values: Array, subject: NDArray[Any]
-) -> tuple[float, float, float]:
+def variance_components(values: Array, subject: AnyArray) -> tuple[float, float, float]:
     """Mean, variance between subjects and variance of repeats of one subject, by
     restricted maximum likelihood.
 

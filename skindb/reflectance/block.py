@@ -7,7 +7,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.jit import sample_bits
 from skindb.reflectance import _shade_kernels
@@ -23,7 +22,7 @@ from skindb.reflectance.model import (
 )
 from skindb.reflectance.tables import Table
 from skindb.schema import variables
-from skindb.types import Array
+from skindb.types import Array, Float32
 
 MODES = ("linear", "perceptual")  # in the order of `_lumitexel_kernels`
 # that any model has after a first pass, in the order of `SurfaceFit` after its parameters
@@ -110,15 +109,13 @@ def empty_judgement(
     )
 
 
-def shade_diffuse(points: Points, lamp: Lamp, *, eta: float) -> NDArray[np.float32]:
+def shade_diffuse(points: Points, lamp: Lamp, *, eta: float) -> Float32:
     """Radiance (n, 3) of the diffuse term alone, see `ReflectanceModel.shade`."""
     none = np.zeros((len(points.position), 0))
     return shade_tables(points._replace(parameters=none), NO_TABLE, lamp, eta=eta)
 
 
-def shade_tables(
-    points: Points, table: Table, lamp: Lamp, *, eta: float
-) -> NDArray[np.float32]:
+def shade_tables(points: Points, table: Table, lamp: Lamp, *, eta: float) -> Float32:
     """Radiance (n, 3) of the diffuse term and of mixtures of tables (nh, nd, np, k)."""
     out = np.empty((len(points.position), 3), np.float32)
     _shade_kernels.shade(

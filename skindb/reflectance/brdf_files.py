@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
 from skindb.errors import Fault, InputError
@@ -31,7 +30,7 @@ from skindb.reflectance.tables import (
     directional_albedo,
     lookup,
 )
-from skindb.types import Array
+from skindb.types import AnyArray, Array, Index
 
 TABLE = "basis_brdf"
 NODES = ANGLES
@@ -124,9 +123,7 @@ def read_tables(path: str | Path) -> Dictionary:
     )
 
 
-def write_tables(
-    path: str | Path, dictionary: Dictionary, **extra: NDArray[Any]
-) -> None:
+def write_tables(path: str | Path, dictionary: Dictionary, **extra: AnyArray) -> None:
     """Write a file for `read_tables`, with `extra` arrays."""
     grid = dictionary.grid
     arrays: dict[str, Any] = {
@@ -142,7 +139,7 @@ def write_tables(
         np.savez_compressed(stream, **(arrays | extra))
 
 
-def _load(path: Path) -> dict[str, NDArray[Any]]:
+def _load(path: Path) -> dict[str, AnyArray]:
     try:
         with path.open("rb") as data, np.load(data, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
@@ -177,7 +174,7 @@ def _load(path: Path) -> dict[str, NDArray[Any]]:
     return arrays | {name: arrays[name].astype(np.float64) for name in NODES}
 
 
-def _channel_mean(brdf: NDArray[Any]) -> Array:
+def _channel_mean(brdf: AnyArray) -> Array:
     """Mean over channels of one material (theta_h, theta_d, phi_d) [, RGB]; NaN where
     any channel is NaN.
 
@@ -187,7 +184,7 @@ def _channel_mean(brdf: NDArray[Any]) -> Array:
     return np.asarray(grey.mean(axis=-1) if grey.ndim == 4 else grey)
 
 
-def _node_faults(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[Fault]:
+def _node_faults(path: Path, arrays: Mapping[str, AnyArray]) -> list[Fault]:
     faults = []
     for name, minimum in zip(NODES, (2, 2, 1), strict=True):
         nodes = arrays[name]
@@ -212,7 +209,7 @@ def _node_faults(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[Fault]:
     return faults
 
 
-def _shape_faults(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[Fault]:
+def _shape_faults(path: Path, arrays: Mapping[str, AnyArray]) -> list[Fault]:
     brdf = arrays[TABLE]
     lengths = tuple(arrays[name].size for name in NODES)
     if (
@@ -288,7 +285,7 @@ def _range_faults(name: str, nodes: Array, place: str) -> list[Fault]:
     return []
 
 
-def _unit_faults(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[Fault]:
+def _unit_faults(path: Path, arrays: Mapping[str, AnyArray]) -> list[Fault]:
     faults = []
     if "units" in arrays and str(arrays["units"]) not in UNITS:
         unit = str(arrays["units"])
@@ -308,7 +305,7 @@ def _unit_faults(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[Fault]:
     return faults
 
 
-def _value_faults(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[Fault]:
+def _value_faults(path: Path, arrays: Mapping[str, AnyArray]) -> list[Fault]:
     brdf = arrays[TABLE]
     place = f"{path}[{TABLE}]"
     faults = []
@@ -523,7 +520,7 @@ def to_grid(brdf: Array, nodes: Nodes) -> Table:
     return table.astype(np.float32)
 
 
-def _periodic_nodes(phi_d: Array) -> tuple[Array, NDArray[np.int64]]:
+def _periodic_nodes(phi_d: Array) -> tuple[Array, Index]:
     """Nodes with one more on both sides of their period pi, and the column of each."""
     n = len(phi_d)
     return np.concatenate([[phi_d[-1] - np.pi], phi_d, [phi_d[0] + np.pi]]), np.arange(

@@ -16,7 +16,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.reflectance import _ggx_kernels
@@ -56,7 +55,7 @@ from skindb.reflectance.sampling import (
 from skindb.reflectance.tables import Table, tabulate
 from skindb.schema import FitStatus, check, dataset, variables
 from skindb.schema.notes import Omission
-from skindb.types import Array
+from skindb.types import Array, Float32
 
 ALBEDO_NODES = 24  # roughnesses at which the reflectance of a lobe is integrated
 # tables that stand for all lobes of a take, between which weights are interpolated; with a
@@ -209,7 +208,7 @@ class GGX:
             variables.SURFACE_REFLECTANCE_ERROR: np.sqrt(variance),
         }
 
-    def shade(self, points: Points, lamp: Lamp, *, eta: float) -> NDArray[np.float32]:
+    def shade(self, points: Points, lamp: Lamp, *, eta: float) -> Float32:
         """Radiance (n, 3) per radiant intensity [sr^-1 mm^-2], see `ReflectanceModel`."""
         out = shade_diffuse(points, lamp, eta=eta)
         if points.parameters.shape[1] > 0:

@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.reflectance import _row_kernels
@@ -50,7 +49,7 @@ from skindb.reflectance.tables import (
 )
 from skindb.schema import FitStatus, check, dataset, variables
 from skindb.schema.notes import Omission
-from skindb.types import Array, Float64
+from skindb.types import AnyArray, Array, Float32, Float64, Index, Index32, Mask
 
 DICTIONARY_VARIABLES = (  # in the order of `SurfaceFit`
     variables.DICTIONARY_WEIGHT,
@@ -294,7 +293,7 @@ class Mixture:
             ),
         }
 
-    def shade(self, points: Points, lamp: Lamp, *, eta: float) -> NDArray[np.float32]:
+    def shade(self, points: Points, lamp: Lamp, *, eta: float) -> Float32:
         """Radiance (n, 3) per radiant intensity [sr^-1 mm^-2], see `ReflectanceModel`.
 
         sum over lamp points of lit cos(theta_i) / d^2 falloff (F_t(i) F_t(o) R_d / pi +
@@ -353,8 +352,8 @@ def basis_rows(
     normal: Array,
     to_light: Array,
     to_camera: Array,
-    usable: NDArray[np.bool_],
-) -> tuple[Table, NDArray[np.int64], NDArray[np.int32]]:
+    usable: Mask,
+) -> tuple[Table, Index, Index32]:
     """Rows cos(theta_i) b_j(w_i, w_o) of all usable samples, in the order of surfels.
 
     Parameters
@@ -394,13 +393,13 @@ def basis_rows(
     return rows[:, : table.shape[3]], offsets, index
 
 
-def _above_horizon(normal: Array, away: Array) -> NDArray[np.bool_]:
+def _above_horizon(normal: Array, away: Array) -> Mask:
     """(n, d) mask of directions above the horizon; false for NaN and infinite ones."""
     cosine = np.einsum("sc,sdc->sd", normal, away)
     return np.asarray(np.isfinite(cosine) & (cosine > 0))
 
 
-def _read_only(array: NDArray[Any]) -> NDArray[Any]:
+def _read_only(array: AnyArray) -> AnyArray:
     """A view that cannot be written: memory-mapped arrays are read-only, and kernels would
     be compiled for both kinds otherwise.
     """

@@ -8,12 +8,11 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.reflectance.dictionary import Dictionary
 from skindb.reflectance.tables import Table
 from skindb.schema.notes import Omission
-from skindb.types import Array
+from skindb.types import AnyArray, Array, Float32, Index
 
 # `Comparison.min_width` of fits: the peaks of narrower lobes would be extrapolated
 MIN_LOBE_WIDTH = 2.0 / 3.0
@@ -27,12 +26,12 @@ class Noise(NamedTuple):
     is then floor^2 + shot sample, or unknown if shot is 0.
     """
 
-    per_radiance: NDArray[np.float32]  # (n, lights) reflectance of radiance 1
-    pixels: NDArray[np.float32]  # (n, cameras) effective number of pixels
+    per_radiance: Float32  # (n, lights) reflectance of radiance 1
+    pixels: Float32  # (n, cameras) effective number of pixels
     # (cameras, exposures) radiance up to which an exposure is usable, from the longest
-    limit: NDArray[np.float32]
-    read: NDArray[np.float32]  # (cameras, exposures) variance of radiance 0
-    slope: NDArray[np.float32]  # (cameras, exposures) variance over radiance
+    limit: Float32
+    read: Float32  # (cameras, exposures) variance of radiance 0
+    slope: Float32  # (cameras, exposures) variance over radiance
     floor: float  # sr^-1
     shot: float  # sr^-1
 
@@ -46,16 +45,16 @@ def typical_noise(floor: float = 0.0, shot: float = 0.0) -> Noise:
 class Block(NamedTuple):
     """Samples of n surfels, with all that a fit of their surface needs."""
 
-    sample: NDArray[Any]  # (n, lights, cameras, 3) sr^-1; half floats, or their bits
-    position: NDArray[Any]  # (n, 3) mm
-    light: NDArray[Any]  # (lights, 3) mm
-    camera: NDArray[Any]  # (cameras, 3) mm
-    normal: NDArray[Any]  # (n, 3) unit shading normals
-    diffuse: NDArray[Any]  # (n, 3) R_d
+    sample: AnyArray  # (n, lights, cameras, 3) sr^-1; half floats, or their bits
+    position: AnyArray  # (n, 3) mm
+    light: AnyArray  # (lights, 3) mm
+    camera: AnyArray  # (cameras, 3) mm
+    normal: AnyArray  # (n, 3) unit shading normals
+    diffuse: AnyArray  # (n, 3) R_d
     noise: Noise = typical_noise()
     # (lights, cameras) product of their degrees of circular polarisation; (0, 0) without
     # polarisers
-    polarisation: NDArray[Any] = np.zeros((0, 0))
+    polarisation: AnyArray = np.zeros((0, 0))
 
 
 class Comparison(NamedTuple):
@@ -82,11 +81,11 @@ class SurfaceFit(NamedTuple):
     # lower bound of the condition number of the parameters; surfels above
     # `MAX_CONDITION_TRUSTED` are doubtful
     condition: Array
-    samples: NDArray[Any]
+    samples: AnyArray
     # smallest angle between the normal and a half vector of the samples [degree]
     half_angle: Array
-    iterations: NDArray[Any]
-    status: NDArray[Any]
+    iterations: AnyArray
+    status: AnyArray
 
 
 class Judgement(NamedTuple):
@@ -98,7 +97,7 @@ class Judgement(NamedTuple):
     normal_error: Array | None = None
     # (lights, cameras) 0 for samples that are fitted, 1 under held-out lights, 2 in
     # held-out cameras, 3 for both
-    held: NDArray[np.int64] | None = None
+    held: Index | None = None
     outliers: bool = False
 
 
@@ -116,7 +115,7 @@ class JudgedFit(NamedTuple):
     held_error: Array
     outlier: Array  # (n,) fraction of outlying samples
     # (lights, cameras, bins) histograms of scaled residuals, the sum over the surfels
-    counts: NDArray[np.int64]
+    counts: Index
 
 
 class Points(NamedTuple):
@@ -135,7 +134,7 @@ class Lamp(NamedTuple):
     # (n, q, 3) points [mm] that represent equal parts of the light's disc
     place: Array
     # (n, q) visible fraction, 0 to 1, of the part of the disc that each represents
-    lit: NDArray[np.float32]
+    lit: Float32
     axis: Array  # (3,) unit direction in which the light shines
     falloff: float  # exponent n of its fall-off cos^n
 
@@ -232,7 +231,7 @@ class ReflectanceModel(Protocol):
         `surface_reflectance` and `surface_reflectance_error`.
         """
 
-    def shade(self, points: Points, lamp: Lamp, *, eta: float) -> NDArray[np.float32]:
+    def shade(self, points: Points, lamp: Lamp, *, eta: float) -> Float32:
         """Radiance (n, 3) per radiant intensity [sr^-1 mm^-2] of the diffuse and the
         surface term (eq. 1, 3, 8).
         """

@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from skindb.cache import cached_arrays
@@ -38,7 +37,7 @@ from skindb.reflectance.tables import (
     stored_brdf,
 )
 from skindb.schema import FitStatus, check, dataset
-from skindb.types import Array
+from skindb.types import AnyArray, Array, Index, Mask
 
 FRANK_WOLFE_STEPS = 200  # each step gives a valid bound; 500 steps lower it by 1 %
 MIN_COSINE_SAMPLES = 0.1  # cosine to light and camera above which fits use samples
@@ -133,7 +132,7 @@ def _cell_weight(mean: Array, grid: TableGrid) -> Array:
 def reduced_dictionary(dictionary: Dictionary, rank: int) -> tuple[Table, Array]:
     """`reduce_dictionary` of the tables; cached for the takes of a dome."""
 
-    def make() -> dict[str, NDArray[Any]]:
+    def make() -> dict[str, AnyArray]:
         reduced, lift = reduce_dictionary(
             dictionary.table, rank, exact=dictionary.exact
         )
@@ -202,7 +201,7 @@ def truncation_bound(table: Table, reduced: Table, lift: Array) -> Truncation:
 def rank_truncation(dictionary: Dictionary, rank: int) -> Truncation:
     """`truncation_bound` of `reduced_dictionary`; cached for the takes of a dome."""
 
-    def make() -> dict[str, NDArray[Any]]:
+    def make() -> dict[str, AnyArray]:
         reduced = reduced_dictionary(dictionary, rank)
         bound = truncation_bound(dictionary.table, *reduced)
         return {"rms": np.array(bound.rms), "worst": np.array(bound.worst)}
@@ -213,7 +212,7 @@ def rank_truncation(dictionary: Dictionary, rank: int) -> Truncation:
     return Truncation(float(cached["rms"]), float(cached["worst"]))
 
 
-def nodes_above(grid: TableGrid, elevation: float) -> NDArray[np.bool_]:
+def nodes_above(grid: TableGrid, elevation: float) -> Mask:
     """(nh, nd, np) nodes of all cells that contain a pair of directions whose cosines
     both exceed `elevation`.
 
@@ -342,7 +341,7 @@ def reduce_basis(
     )
 
 
-def _mean_weight(weight: Array, area: Array, good: NDArray[np.int64]) -> Array:
+def _mean_weight(weight: Array, area: Array, good: Index) -> Array:
     """Mean (m,) of the weights (n, m) of some surfels, weighted by area (n,)."""
     # in parts: a million surfels in double precision would take half a gigabyte
     parts = (good[i : i + PART] for i in range(0, len(good), PART))
@@ -350,7 +349,7 @@ def _mean_weight(weight: Array, area: Array, good: NDArray[np.int64]) -> Array:
     return np.asarray(np.sum(sums, axis=0) / area[good].sum())
 
 
-def fitted_surfels(fitted: xr.Dataset, names: Sequence[str]) -> NDArray[np.int64]:
+def fitted_surfels(fitted: xr.Dataset, names: Sequence[str]) -> Index:
     """Indices of the surfels whose every stage was fitted, with finite variables `names`.
 
     Raises
@@ -390,7 +389,7 @@ class Systems:
     count: Array  # (n,) number of values in r
 
     @classmethod
-    def of(cls, rows: Array, offsets: NDArray[np.int64], target: Array) -> Systems:
+    def of(cls, rows: Array, offsets: Index, target: Array) -> Systems:
         """Normal equations of rows (total, m) and samples (total, channels); `offsets`
         (n + 1,) start each surfel.
         """

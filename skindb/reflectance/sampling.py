@@ -7,10 +7,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.reflectance.tables import directional_albedo
-from skindb.types import Array
+from skindb.types import Array, Float32, Mask
 
 # fraction of directions drawn by the cosine alone, as tables have tails that do not
 # depend on the half vector
@@ -33,7 +32,7 @@ class TableSampler:
     albedo: Array
 
     @classmethod
-    def of_tables(cls, tables: NDArray[np.float32]) -> TableSampler:
+    def of_tables(cls, tables: Float32) -> TableSampler:
         """Densities in proportion to the mean of each table (nh, nd, np, k) over its
         other angles, times the cosine.
         """
@@ -135,7 +134,7 @@ def by_half_vector(
     view: Array,
     cosine: Array,
     turn: Array,
-    mirrored: NDArray[np.bool_],
+    mirrored: Mask,
 ) -> Array:
     """Directions (n, 3) at a cosine (n,) to the normal and an azimuth `turn` (n,); where
     `mirrored`, the view mirrored at this direction instead.

@@ -12,14 +12,13 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.jit import sample_bits
 from skindb.reflectance._separation_kernels import separate_block
 from skindb.reflectance.dictionary import abc_parameters, evaluate_abc
 from skindb.reflectance.model import Block
 from skindb.reflectance.tables import DEFAULT_GRID, TableGrid, tabulate
-from skindb.types import Array, Float64
+from skindb.types import Array, Float32, Float64
 
 # The six most different embedded materials, from narrow to nearly diffuse. The width of
 # the broadest one trades two errors: broad lobes take light from R_d, and without them
@@ -88,7 +87,7 @@ def separate_diffuse(
 
 
 @cache
-def surface_lobes() -> tuple[NDArray[np.float32], TableGrid]:
+def surface_lobes() -> tuple[Float32, TableGrid]:
     """Tables (nh, nd, np, 6) of `LOBES` without their diffuse part, and their grid."""
     rows = np.array([abc_parameters()[name] for name in LOBES], np.float64)
     rows[:, :3] = 0
@@ -98,7 +97,7 @@ def surface_lobes() -> tuple[NDArray[np.float32], TableGrid]:
 
 
 @cache
-def _lobe_table() -> NDArray[np.float32]:
+def _lobe_table() -> Float32:
     """Tables (nh, nd, np, 16) for the kernel: six lobes, two zeros, their derivatives
     by theta_h [rad], two zeros.
     """

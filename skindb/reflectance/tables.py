@@ -6,17 +6,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from skindb.jit import LANES
 from skindb.optics.angles import directions, half_difference
-from skindb.types import Array, Float64
+from skindb.types import AnyArray, Array, Float32, Float64
 
-Table = NDArray[np.float32]
+Table = Float32
 ANGLES = ("theta_h", "theta_d", "phi_d")
 WIDTH_DIFFERENCE = np.radians(20)  # theta_d at which widths of lobes are measured
 
@@ -74,7 +73,7 @@ def tabulate(
 
 
 def lookup(
-    table: NDArray[Any], theta_h: ArrayLike, theta_d: ArrayLike, phi_d: ArrayLike
+    table: AnyArray, theta_h: ArrayLike, theta_d: ArrayLike, phi_d: ArrayLike
 ) -> Array:
     """Interpolate a table (nh, nd, np, m) trilinearly at angles [rad], (..., m); phi_d
     has period pi.
@@ -103,9 +102,7 @@ def lookup(
     return total
 
 
-def brdf_metric(
-    tables: NDArray[Any], *, weighted_like: NDArray[Any] | None = None
-) -> Array:
+def brdf_metric(tables: AnyArray, *, weighted_like: AnyArray | None = None) -> Array:
     """Gram matrix (m, m) of the bases over pairs of directions above the horizon.
 
     Pairs are weighted by their solid angles, both cosines, and the mean of the bases to
@@ -133,7 +130,7 @@ def brdf_metric(
 NODES = 96  # of theta_h in `directional_albedo`
 
 
-def directional_albedo(table: NDArray[Any], cos_o: ArrayLike) -> Array:
+def directional_albedo(table: AnyArray, cos_o: ArrayLike) -> Array:
     """Fraction (k, m) of the light from a direction that is reflected, for cosines (k,)
     of that direction.
 
@@ -166,7 +163,7 @@ def directional_albedo(table: NDArray[Any], cos_o: ArrayLike) -> Array:
     return np.stack(rows)
 
 
-def half_widths(table: NDArray[Any]) -> Float64:
+def half_widths(table: AnyArray) -> Float64:
     """Half width at half maximum (m,) [rad], as an angle theta_h between the normal and
     the half vector, of BRDFs (nh, nd, np, m) at theta_d of about 20 degrees; pi / 2 for
     BRDFs that nowhere fall below half of their peak, and 0 for black ones.
@@ -197,7 +194,7 @@ def pad_to_lanes(table: Table) -> Table:
     )
 
 
-def stored_brdf(tables: NDArray[Any]) -> NDArray[Any]:
+def stored_brdf(tables: AnyArray) -> AnyArray:
     """Tables (nh, nd, np, k) of the kernels as `basis_brdf` (k, nh, nd, np + 1): the
     period's end repeats its begin.
     """
@@ -205,7 +202,7 @@ def stored_brdf(tables: NDArray[Any]) -> NDArray[Any]:
     return np.concatenate([moved, moved[..., :1]], axis=-1)
 
 
-def brdf_coords(grid: TableGrid) -> dict[str, NDArray[Any]]:
+def brdf_coords(grid: TableGrid) -> dict[str, AnyArray]:
     """Nodes of `stored_brdf` [rad]."""
     return {
         "theta_h": grid.theta_h,

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.files import private_file
@@ -16,14 +15,14 @@ from skindb.geometry.rays import RayScene
 from skindb.render.image import encode_srgb
 from skindb.schema import variables
 from skindb.schema.consent import honour_consent
+from skindb.types import Array, Faces, Float64, Index
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 from skindb.plots import plain_text
 from skindb.render.image import auto_exposure, tone_map
 
-Float = NDArray[np.floating[Any]]
-View = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
+View = tuple[Index, Float64, Float64]
 TURNS = (0.0, 55.0)  # degrees to the subject's left
 # percentiles of the visible values at the ends of the colour scale, so that outliers do
 # not set it
@@ -91,7 +90,7 @@ def field_figure(
     return _scalar_figure(chosen, views, title + _units(values))
 
 
-def _figure(images: Sequence[NDArray[np.float64]], title: str) -> Figure:
+def _figure(images: Sequence[Float64], title: str) -> Figure:
     """Pictures (rows, columns, 3) in [0, 1] side by side."""
     from matplotlib import pyplot
 
@@ -138,7 +137,7 @@ def _scalar_figure(chosen: xr.DataArray, views: Sequence[View], title: str) -> F
 
 def _colour_images(
     chosen: xr.DataArray, views: Sequence[View]
-) -> tuple[list[NDArray[np.float64]], str]:
+) -> tuple[list[Float64], str]:
     """Pictures of a variable (surfel, 3) of colours or unit vectors, and a description
     of their scale.
     """
@@ -162,7 +161,7 @@ def _colour_images(
     return images, scale
 
 
-def _white(values: Float) -> float:
+def _white(values: Array) -> float:
     """The value of the largest channel that is drawn white, of values (n, 3); 1 if none
     is above zero.
     """
@@ -228,8 +227,8 @@ def write_field(
 
 
 def trace_front(
-    position: Float,
-    triangle: NDArray[np.integer[Any]],
+    position: Array,
+    triangle: Faces,
     turn: float = 0.0,
     *,
     size: int = 480,
@@ -299,7 +298,7 @@ def trace_front(
     )
 
 
-def _field(view: View, values: Float, *, nearest: bool) -> NDArray[np.float64]:
+def _field(view: View, values: Array, *, nearest: bool) -> Float64:
     """Values (n,) interpolated in a view; NaN beside the face, and where a corner with
     a weight has no value.
     """
@@ -370,7 +369,7 @@ def _chosen(
     return values
 
 
-def _shades(chosen: xr.DataArray) -> tuple[NDArray[np.float64], list[str]]:
+def _shades(chosen: xr.DataArray) -> tuple[Float64, list[str]]:
     """Numbers (n,) to colour, and for categories their names."""
     values = chosen.values
     if "flag_values" in chosen.attrs:
@@ -386,7 +385,7 @@ def _shades(chosen: xr.DataArray) -> tuple[NDArray[np.float64], list[str]]:
     return values.astype(np.float64), []
 
 
-def _span(values: NDArray[np.float64]) -> tuple[float, float]:
+def _span(values: Float64) -> tuple[float, float]:
     low, high = (
         (float(v) for v in np.percentile(values, RANGE)) if len(values) else (0.0, 1.0)
     )
@@ -406,7 +405,7 @@ def _plain_units(values: xr.DataArray) -> str:
 @plain_text()
 def write_grid(
     path: Path,
-    rows: Mapping[str, Sequence[NDArray[np.floating]]],
+    rows: Mapping[str, Sequence[Array]],
     titles: Sequence[str],
     *,
     exposure: float | None = None,
@@ -454,7 +453,7 @@ def write_grid(
     pyplot.close(figure)
 
 
-def _lit(images: Sequence[NDArray[np.floating]]) -> tuple[slice, slice]:
+def _lit(images: Sequence[Array]) -> tuple[slice, slice]:
     """Rows and columns of the part where any of the pictures is above zero."""
     lit = np.any([np.nan_to_num(image).max(axis=2) > 0 for image in images], axis=0)
     if not lit.any():

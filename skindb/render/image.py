@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import imagecodecs
 import numpy as np
 import OpenEXR
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from skindb.errors import Fault, InputError
 from skindb.files import private_file
+from skindb.types import AnyArray, Bytes, Float32, Float64, Mask
 
-Image = NDArray[np.float32]
+Image = Float32
 DAMAGED = "a file that is cut off, damaged or of another format"
 WHITE_QUANTILE = 0.995  # fraction of the lit pixels that a display image does not clip
 
 
-def encode_srgb(linear: ArrayLike) -> NDArray[np.float64]:
+def encode_srgb(linear: ArrayLike) -> Float64:
     """Encode linear values as sRGB display values, clipped to [0, 1] (IEC 61966-2-1)."""
     x = np.clip(np.asarray(linear, np.float64), 0, 1)
     return np.where(
@@ -27,15 +27,13 @@ def encode_srgb(linear: ArrayLike) -> NDArray[np.float64]:
     )
 
 
-def decode_srgb(display: ArrayLike) -> NDArray[np.float64]:
+def decode_srgb(display: ArrayLike) -> Float64:
     """Decode sRGB display values in [0, 1] to linear values (IEC 61966-2-1)."""
     y = np.asarray(display, np.float64)
     return np.where(y <= 0.04045, y / 12.92, ((y + 0.055) / 1.055) ** 2.4)
 
 
-def auto_exposure(
-    radiance: ArrayLike, *, mask: NDArray[np.bool_] | None = None
-) -> float:
+def auto_exposure(radiance: ArrayLike, *, mask: Mask | None = None) -> float:
     """Exposure that maps the brightest lit pixels (99.5 % quantile of the largest
     channel) to display white.
 
@@ -58,9 +56,7 @@ def auto_exposure(
     return float(1 / np.quantile(values, WHITE_QUANTILE)) if values.size else 1.0
 
 
-def tone_map(
-    radiance: ArrayLike, *, exposure: float | None = None
-) -> NDArray[np.uint8]:
+def tone_map(radiance: ArrayLike, *, exposure: float | None = None) -> Bytes:
     """Convert linear Rec. 709 radiance to an 8-bit sRGB picture.
 
     The only curve is that of sRGB, so that pictures with equal exposures are comparable.
@@ -80,7 +76,7 @@ def tone_map(
         return np.round(encode_srgb(values * gain) * 255).astype(np.uint8)
 
 
-def write_png(path: str | Path, picture: NDArray[Any]) -> None:
+def write_png(path: str | Path, picture: AnyArray) -> None:
     """Write (h, w), (h, w, 3) or (h, w, 4) uint8 or uint16 values as PNG."""
     if picture.dtype not in (np.uint8, np.uint16):
         raise ValueError(
@@ -91,7 +87,7 @@ def write_png(path: str | Path, picture: NDArray[Any]) -> None:
     )
 
 
-def read_png(path: str | Path) -> NDArray[Any]:
+def read_png(path: str | Path) -> AnyArray:
     """Read the values of a PNG in the dtype of the file (uint8 or uint16)."""
     try:
         return np.asarray(imagecodecs.png_decode(_bytes(path)))
@@ -103,7 +99,7 @@ def read_png(path: str | Path) -> NDArray[Any]:
 
 def write_exr(
     path: str | Path,
-    channels: NDArray[Any] | Mapping[str, NDArray[Any]],
+    channels: AnyArray | Mapping[str, AnyArray],
     *,
     attributes: Mapping[str, str] | None = None,
 ) -> None:
@@ -151,8 +147,8 @@ def read_exr(path: str | Path) -> tuple[Image, tuple[str, ...]]:
 
 
 def _planes(
-    channels: NDArray[Any] | Mapping[str, NDArray[Any]],
-) -> dict[str, NDArray[Any]]:
+    channels: AnyArray | Mapping[str, AnyArray],
+) -> dict[str, AnyArray]:
     if isinstance(channels, Mapping):
         planes = dict(channels)
     elif channels.ndim == 2:

@@ -26,10 +26,9 @@ from skindb.render.shading import (
     trace_view,
     transmitted_irradiance,
 )
-from skindb.types import Mask, Progress
+from skindb.types import Array, Float32, Index, Mask, Progress
 
-Float = NDArray[np.floating[Any]]
-Image = NDArray[np.float32]
+Image = Float32
 # rays per pixel and axis in one batch; random numbers are stratified over the rays of a
 # pixel. Environments need more
 RAYS_PER_AXIS = 2
@@ -202,7 +201,7 @@ class _Painter:
     choice: LightChoice | None  # None without lights
     # (v, 3) `bounced_exitance` by the lights, from their centres: shadows of discs do not
     # matter for it
-    bounced: Float | None
+    bounced: Array | None
 
     @classmethod
     def of(
@@ -251,7 +250,7 @@ class _Painter:
 
     def _by_lights(
         self, hits: _Hits, choice: LightChoice, rng: np.random.Generator
-    ) -> Float:
+    ) -> Array:
         """Radiance (n, 3) from a few lights per hit, which are drawn in proportion to
         the power that arrives there.
         """
@@ -285,7 +284,7 @@ class _Painter:
 
     def _by_environment(
         self, hits: _Hits, environment: Environment, rng: np.random.Generator
-    ) -> Float:
+    ) -> Array:
         """Radiance (n, 3) from the environment: one direction drawn by luminance, one
         by the BRDF (Veach 1997).
         """
@@ -320,7 +319,7 @@ class _Painter:
             values[rows] += shaded * environment.along(towards[rows])
         return values
 
-    def _received(self, rng: np.random.Generator) -> Float:
+    def _received(self, rng: np.random.Generator) -> Array:
         """Irradiance (v, 3) under the boundary, F_t(w_i) E, at the vertices; an
         independent estimate in each batch.
         """
@@ -342,8 +341,8 @@ class _Painter:
         return out
 
     def _received_from_lights(
-        self, points: Float, normals: Float, lights: Lights, rng: np.random.Generator
-    ) -> Float:
+        self, points: Array, normals: Array, lights: Lights, rng: np.random.Generator
+    ) -> Array:
         received = np.zeros((len(points), 3))
         for i in range(len(lights)):
             towards = points_on_discs(lights, np.full(len(points), i), rng) - points
@@ -363,11 +362,11 @@ class _Painter:
 
     def _received_from_environment(
         self,
-        points: Float,
-        normals: Float,
+        points: Array,
+        normals: Array,
         environment: Environment,
         rng: np.random.Generator,
-    ) -> Float:
+    ) -> Array:
         """Half of the directions are drawn by luminance, half by the cosine (balance
         heuristic, Veach 1997).
         """
@@ -408,12 +407,12 @@ class _Hits:
 
     def shade(
         self,
-        rows: NDArray[np.int64],
-        lamp: Float,
-        weight: Float,
+        rows: Index,
+        lamp: Array,
+        weight: Array,
         axis: Any = (0.0, 0.0, 1.0),
         falloff: Any = 0.0,
-    ) -> Float:
+    ) -> Array:
         """Radiance (m, 3) of chosen hits, each under a point light (m, 3) of its own
         with intensity `weight` (m,).
         """
@@ -434,12 +433,12 @@ class LightChoice:
     """
 
     lights: Lights
-    probability: Float  # (cells, l)
+    probability: Array  # (cells, l)
     # (cells * l,) cumulative probability within a cell, plus the index of the cell
-    rising: Float
+    rising: Array
 
     @classmethod
-    def of_lights(cls, lights: Lights, centre: Float) -> LightChoice:
+    def of_lights(cls, lights: Lights, centre: Array) -> LightChoice:
         """Probabilities for surfaces near `centre` (3,) [mm]."""
         towards = lights.position - centre
         distance = np.linalg.norm(towards, axis=1)
@@ -459,7 +458,7 @@ class LightChoice:
         )
         power[:, :] += power.sum() == 0  # lights that are all off
         probability = power / power.sum(axis=1, keepdims=True)
-        rising: Float = np.cumsum(probability, axis=1)
+        rising: Array = np.cumsum(probability, axis=1)
         rising /= rising[:, -1:]
         return cls(
             lights,
@@ -467,9 +466,7 @@ class LightChoice:
             np.ravel(rising + np.arange(float(len(rising)))[:, None]),
         )
 
-    def draw(
-        self, view: View, rng: np.random.Generator
-    ) -> list[tuple[NDArray[np.int64], Float]]:
+    def draw(self, view: View, rng: np.random.Generator) -> list[tuple[Index, Array]]:
         """Indices (n,) and inverse probabilities (n,) of the lights of each hit;
         LIGHTS_PER_RAY such pairs.
         """
@@ -495,7 +492,7 @@ class LightChoice:
         return drawn
 
 
-def stratified(view: View, rng: np.random.Generator) -> Float:
+def stratified(view: View, rng: np.random.Generator) -> Array:
     """Uniform numbers (n, 2), stratified over the rays of each pixel: in cells of the
     square, and in rows and columns of as many as there are rays (Chiu et al. 1994).
     """
@@ -516,9 +513,7 @@ def _shuffled(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.in
     return rng.random(shape, np.float32).argsort(axis=-1)
 
 
-def points_on_discs(
-    lights: Lights, chosen: NDArray[np.int64], rng: np.random.Generator
-) -> Float:
+def points_on_discs(lights: Lights, chosen: Index, rng: np.random.Generator) -> Array:
     """Points (n, 3) drawn uniformly on the discs of the chosen lights (n,)."""
     tangent, second = tangents(np.asarray(lights.axis, np.float64))
     radius = lights.disc_radius[chosen] * np.sqrt(rng.random(len(chosen)))

@@ -7,11 +7,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage
 from scipy.ndimage import binary_erosion
 from skimage.metrics import structural_similarity
@@ -31,12 +30,12 @@ from skindb.render.shading import (
 from skindb.render.surfels import surfel_confidence
 from skindb.schema import check, variables
 from skindb.schema.consent import honour_consent
-from skindb.types import Mask
+from skindb.types import Array, Bytes, Float32, Float64, Mask
 
 # pixels, the default of Wang et al. 2004's uniform window in scikit-image
 SSIM_WINDOW = 7
-Float = NDArray[np.float64]
-Image = NDArray[np.floating[Any]]
+Float = Float64
+Image = Array
 # of the median of lit pixels; darker pixels of the rendering are in shadow
 LIT_FRACTION = 0.05
 MIN_PIXELS = 50  # of a class, below which its measure is NaN
@@ -298,14 +297,14 @@ class Comparison:
     light: str
     camera: str
     held_out: bool  # the fit did not see this light or this camera
-    photographed: NDArray[np.float32]  # (h, w, 3) radiance
-    rendered: NDArray[np.float32]  # (h, w, 3) radiance
-    mask: NDArray[np.bool_]  # (h, w) pixels compared
+    photographed: Float32  # (h, w, 3) radiance
+    rendered: Float32  # (h, w, 3) radiance
+    mask: Mask  # (h, w) pixels compared
     # part of these pixels that shows unfitted surfels, with the values of the nearest fitted
     # ones
     filled: float
     error: dict[str, float]  # from `compare_images`
-    diffuse: NDArray[np.float32]  # (h, w, 3) diffuse part of the rendering
+    diffuse: Float32  # (h, w, 3) diffuse part of the rendering
     regions: dict[str, dict[str, float]]  # the same errors for each region, by its name
     causes: Causes
 
@@ -404,9 +403,9 @@ def _kept_photographs(capture: xr.DataTree) -> list[xr.Dataset]:
 class _Taken:
     """A photograph (h, w, 3), both parts of its rendering, and the pixels compared."""
 
-    photo: NDArray[np.float32]
-    diffuse: NDArray[np.float32]
-    gloss: NDArray[np.float32]
+    photo: Float32
+    diffuse: Float32
+    gloss: Float32
     mask: Mask
 
     def compared(
@@ -415,8 +414,8 @@ class _Taken:
         camera: str,
         is_unseen: bool,
         view: View,
-        regions: dict[str, NDArray[np.float64]],
-        doubtful: NDArray[np.float64],
+        regions: dict[str, Float64],
+        doubtful: Float64,
     ) -> Comparison:
         """Errors of the rendering, also by region, and their likely causes."""
         unfitted = view.image(view.interpolate((doubtful == 1.0)[:, None]))[..., 0]
@@ -447,7 +446,7 @@ class _Taken:
         )
 
 
-def _regions(capture: xr.DataTree) -> dict[str, NDArray[np.float64]]:
+def _regions(capture: xr.DataTree) -> dict[str, Float64]:
     """Membership (surfel,) of the regions that the capture names."""
     surfels = (
         capture["surfels"].to_dataset()
@@ -466,10 +465,10 @@ def _regions(capture: xr.DataTree) -> dict[str, NDArray[np.float64]]:
 
 def _by_region(
     view: View,
-    regions: dict[str, NDArray[np.float64]],
-    rendered: NDArray[np.float32],
-    photo: NDArray[np.float32],
-    mask: NDArray[np.bool_],
+    regions: dict[str, Float64],
+    rendered: Float32,
+    photo: Float32,
+    mask: Mask,
     exposure: float,
 ) -> dict[str, dict[str, float]]:
     """Differences in the pixels of each region, at the exposure of the whole picture."""
@@ -510,7 +509,7 @@ def write_comparisons(comparisons: Sequence[Comparison], folder: Path) -> list[P
 
 def side_by_side(
     comparison: Comparison, *, components: bool = False, exposure: float | None = None
-) -> NDArray[np.uint8]:
+) -> Bytes:
     """Photograph, rendering and difference (h, 3 w, 3) at one exposure, by default that
     of the photograph.
 

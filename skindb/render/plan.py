@@ -5,10 +5,8 @@ resulting error.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.geometry.camera import project
 from skindb.geometry.rays import RayScene
@@ -17,9 +15,8 @@ from skindb.render.monte_carlo import Lighting
 from skindb.render.scene import Camera, Lights, Surface
 from skindb.render.shading import View, entering_light, trace_view, tree_opening
 from skindb.schema.notes import Omission
-from skindb.types import Mask
+from skindb.types import Array, Index, Mask
 
-Float = NDArray[np.floating[Any]]
 Omissions = tuple[Omission, ...]
 # rad, by which normals between the rays of a trace differ from those at the rays
 NORMAL_MARGIN = 0.1
@@ -268,7 +265,7 @@ def notable_lights(
 
 
 def _level(
-    light: Float, lights: Lights, view: View, scene: RayScene, rows: NDArray[np.int64]
+    light: Array, lights: Lights, view: View, scene: RayScene, rows: Index
 ) -> float:
     """Root mean square over chosen hits of the light (l, m, 3) that is not in shadow."""
     position = view.position[rows]
@@ -281,9 +278,7 @@ def _level(
     return float(np.sqrt(np.mean(seen**2)))
 
 
-def _unshadowed(
-    lights: Lights, surface: Surface, view: View, rows: NDArray[np.int64]
-) -> Float:
+def _unshadowed(lights: Lights, surface: Surface, view: View, rows: Index) -> Array:
     """Radiance (l, m, 3) of chosen hits under each light, from its centre and without shadows."""
     diffuse = view.interpolate(surface.diffuse)[rows]
     parameters = view.interpolate(surface.parameters)[rows]
@@ -300,7 +295,7 @@ def _unshadowed(
     return np.stack(radiance)
 
 
-def _irradiance(light: Lights, surface: Surface) -> Float:
+def _irradiance(light: Lights, surface: Surface) -> Array:
     """Irradiance (v, 3) under the boundary of one light, without shadows."""
     towards = light.position[0] - surface.vertices
     square = np.einsum("nc,nc->n", towards, towards)

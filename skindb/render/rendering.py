@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.geometry.rays import RayScene
@@ -43,7 +42,7 @@ from skindb.render.shading import (
 )
 from skindb.schema.consent import honour_consent
 from skindb.schema.notes import Omission
-from skindb.types import Mask, Progress
+from skindb.types import Float32, Mask, Progress
 
 UNITS = "radiance"  # in the unit of the photographs, or of the environment
 NO_LIGHTS = Lights(
@@ -70,7 +69,7 @@ class Picture:
     """Radiance that a camera sees, and what was skipped to compute it."""
 
     # (h, w, 3) linear; empty if the picture is only planned
-    radiance: NDArray[np.float32]
+    radiance: Float32
     camera: str
     lights: list[str]
     skipped: list[str]
@@ -147,7 +146,7 @@ def trace_shot(
     return Shot(surface, lamps, scene, view, plan)
 
 
-def picture(shot: Shot) -> NDArray[np.float32]:
+def picture(shot: Shot) -> Float32:
     """Linear picture (h, w, 3), the sum over the lights."""
     surface = shot.surface
     lamps = shot.lamps
@@ -493,7 +492,7 @@ def fixed_exposure(lighting: Lighting, camera: Camera) -> float:
 
 
 def _write_exr(path: Path, seen: xr.Dataset) -> None:
-    planes: dict[str, NDArray[np.float32]] = {}
+    planes: dict[str, Float32] = {}
     for i, name in enumerate("RGB"):
         planes[name] = seen["radiance"].values[..., i]
         planes[f"variance.{name}"] = seen["radiance_variance"].values[..., i]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import trimesh
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
@@ -25,8 +25,8 @@ from skindb.reflectance.kinds import even_diffuse, surface_model
 from skindb.reflectance.model import ReflectanceModel
 from skindb.render.image import read_exr
 from skindb.schema import FitStatus, check, variables
+from skindb.types import AnyArray, Array, Faces, Index, Mask
 
-Float = NDArray[np.floating[Any]]
 NEEDED = (
     variables.SURFEL_POSITION,
     variables.SHADING_NORMAL,
@@ -43,14 +43,14 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear Rec. 709
 class Surface:
     """Triangles with reflectance at their vertices; values are interpolated over the triangles."""
 
-    vertices: Float  # (v, 3) mm
-    faces: NDArray[np.integer[Any]]  # (f, 3)
-    normals: Float  # (v, 3) unit shading normals
-    diffuse: Float  # (v, 3) R_d and the even reflection of the surface
-    parameters: Float  # (v, p) of the surface model
+    vertices: Array  # (v, 3) mm
+    faces: Faces  # (f, 3)
+    normals: Array  # (v, 3) unit shading normals
+    diffuse: Array  # (v, 3) R_d and the even reflection of the surface
+    parameters: Array  # (v, p) of the surface model
     model: ReflectanceModel
-    s: Float | None = None  # (v, 3) dipole s, for subsurface transport
-    sigma_tr: Float | None = None  # (v, 3) mm^-1, for subsurface transport
+    s: Array | None = None  # (v, 3) dipole s, for subsurface transport
+    sigma_tr: Array | None = None  # (v, 3) mm^-1, for subsurface transport
     eta: float = 1.3
     # whether light that other parts reflect with one diffuse bounce is added
     inter_reflection: bool = False
@@ -69,7 +69,7 @@ class Surface:
         )
 
     @property
-    def known(self) -> NDArray[np.bool_]:
+    def known(self) -> Mask:
         """(v,) vertices with finite values; triangles with any other vertex occlude but
         reflect no light.
         """
@@ -84,15 +84,15 @@ class Surface:
 class Camera:
     """Pinhole camera with OpenCV distortion; pixel centres at integer + 0.5."""
 
-    K: Float  # (3, 3) px
-    R: Float  # (3, 3), x_cam = R x + t
-    t: Float  # (3,) mm
-    distortion: Float  # (5,) k1 k2 p1 p2 k3
+    K: Array  # (3, 3) px
+    R: Array  # (3, 3), x_cam = R x + t
+    t: Array  # (3,) mm
+    distortion: Array  # (5,) k1 k2 p1 p2 k3
     width: int
     height: int
 
     @property
-    def centre(self) -> Float:
+    def centre(self) -> Array:
         """(3,) centre of projection in mm."""
         return np.asarray(-self.R.T @ self.t)
 
@@ -119,11 +119,11 @@ class Camera:
 class Lights:
     """Disc lights; each row of the arrays describes one light."""
 
-    position: Float  # (l, 3) mm
-    intensity: Float  # (l, 3) radiant intensity, radiance mm2
-    disc_radius: Float  # (l,) mm
-    axis: Float  # (l, 3) unit direction each shines along
-    falloff: Float  # (l,) exponent n of cos^n
+    position: Array  # (l, 3) mm
+    intensity: Array  # (l, 3) radiant intensity, radiance mm2
+    disc_radius: Array  # (l,) mm
+    axis: Array  # (l, 3) unit direction each shines along
+    falloff: Array  # (l,) exponent n of cos^n
 
     def __len__(self) -> int:
         return len(self.position)
@@ -233,7 +233,7 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
     )
 
 
-def usable_surfels(values: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
+def usable_surfels(values: dict[str, AnyArray]) -> Mask:
     """(n,) whether a surfel can be rendered: it is fitted, even if doubtfully, and its
     values are finite.
     """
@@ -253,14 +253,12 @@ def usable_surfels(values: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
     return good
 
 
-def _nearest(position: Float, usable: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _nearest(position: Array, usable: Mask) -> Index:
     _, index = cKDTree(position[usable]).query(position)
     return np.asarray(np.flatnonzero(usable)[index], np.int64)
 
 
-def subdivide_surface(
-    surface: Surface, spacing: float, visible: NDArray[np.bool_]
-) -> Surface:
+def subdivide_surface(surface: Surface, spacing: float, visible: Mask) -> Surface:
     """Subdivide the visible triangles of a surface until their edges have at most a given length.
 
     Irradiance is known at vertices, so the mesh limits the sharpness of shadow edges,
@@ -338,7 +336,7 @@ class Environment:
     columns to the right of it are at the subject's left (+x).
     """
 
-    radiance: Float
+    radiance: Array
 
     @classmethod
     def read(cls, path: str | Path) -> Environment:
@@ -380,18 +378,18 @@ class Environment:
             raise InputError(Fault(str(path), rule, fault, cure))
         return cls(values)
 
-    def along(self, direction: Float) -> Float:
+    def along(self, direction: Array) -> Array:
         """Radiance (n, 3) from unit directions (n, 3)."""
         return np.asarray(self.radiance.reshape(-1, 3)[self._texel(direction)])
 
-    def pdf(self, direction: Float) -> Float:
+    def pdf(self, direction: Array) -> Array:
         """Probability density (n,) per steradian with which `sample` draws unit
         directions (n, 3).
         """
         texel = self._texel(direction)
         return np.asarray(self._probability[texel] / self._solid_angle[texel])
 
-    def sample(self, draw: Float) -> Float:
+    def sample(self, draw: Array) -> Array:
         """Unit directions (n, 3) drawn in proportion to luminance, from uniform numbers
         (n, 2) in [0, 1).
 
@@ -410,7 +408,7 @@ class Environment:
         sine = np.sqrt(np.maximum(1 - cosine**2, 0.0))
         return np.stack([sine * np.sin(turn), cosine, sine * np.cos(turn)], axis=1)
 
-    def _texel(self, direction: Float) -> NDArray[np.int64]:
+    def _texel(self, direction: Array) -> Index:
         height, width, _ = self.radiance.shape
         row = np.arccos(np.clip(direction[:, 1], -1, 1)) / np.pi * height
         column = (
@@ -420,18 +418,18 @@ class Environment:
         return np.asarray(row_start + np.minimum(column.astype(np.int64), width - 1))
 
     @cached_property
-    def _solid_angle(self) -> Float:
+    def _solid_angle(self) -> Array:
         height, width, _ = self.radiance.shape
         edge = np.cos(np.pi * np.arange(height + 1) / height)
         return np.repeat((edge[:-1] - edge[1:]) * 2 * np.pi / width, width)
 
     @cached_property
-    def _probability(self) -> Float:
+    def _probability(self) -> Array:
         power = self.radiance.reshape(-1, 3) @ LUMINANCE * self._solid_angle
         return np.asarray(power / power.sum())
 
     @cached_property
-    def _rising(self) -> tuple[NDArray[np.int64], Float]:
+    def _rising(self) -> tuple[Index, Array]:
         """Texels (h w,) from the brightest, and their cumulative probability."""
         brightness = self._probability / self._solid_angle
         order = np.argsort(-brightness, kind="stable")
@@ -439,7 +437,7 @@ class Environment:
         return order, rising / rising[-1]
 
 
-def _inverted(rising: Float, level: Float) -> tuple[NDArray[np.int64], Float]:
+def _inverted(rising: Array, level: Array) -> tuple[Index, Array]:
     """Indices (n,) of the steps of a cumulative sum that contain levels (n,), and the
     fractions of these steps below them.
     """

@@ -6,10 +6,8 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.geometry.camera import pixel_rays
@@ -19,6 +17,7 @@ from skindb.optics.dipole_tree import subsurface_exitance
 from skindb.optics.fresnel import circular_reversal, fresnel_transmittance
 from skindb.reflectance.model import Lamp, Points
 from skindb.render.scene import Camera, Lights, Surface
+from skindb.types import Array, Float32, Index, Mask
 
 DEFAULT_OPENING = 0.1  # of the octree
 # range of openings: below it, the tree takes longer than it saves; above it, pictures
@@ -27,8 +26,7 @@ OPENINGS = (0.02, 0.4)
 # maximum relative error of the exitance against all pairs (docs/performance.md)
 ERROR_PER_OPENING = 0.015
 
-Float = NDArray[np.floating[Any]]
-Image = NDArray[np.float32]
+Image = Float32
 TERMS = ("diffuse", "surface")
 GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
 
@@ -55,7 +53,7 @@ def require_translucency(surface: Surface) -> None:
 
 def transmitted_irradiance(
     surface: Surface, lights: Lights, scene: RayScene
-) -> NDArray[np.float32]:
+) -> Float32:
     """Irradiance (v, l) under the boundary per radiant intensity, F_t(w_i) cos(theta_i)
     / d^2 [mm-2].
 
@@ -83,8 +81,8 @@ def transmitted_irradiance(
 
 
 def entering_light(
-    lights: Lights, i: int, towards: Float, square: Float, cosine: Float, eta: float
-) -> Float:
+    lights: Lights, i: int, towards: Array, square: Array, cosine: Array, eta: float
+) -> Array:
     """Irradiance (n,) under the boundary per radiant intensity of light i [mm-2], without
     shadows, from vectors (n, 3) to the light, their squares, and cosines to the normals.
     """
@@ -98,8 +96,8 @@ def exitances(
     lights: Lights,
     scene: RayScene,
     *,
-    receivers: NDArray[np.bool_] | None = None,
-) -> NDArray[np.float32]:
+    receivers: Mask | None = None,
+) -> Float32:
     """Radiant exitance under the boundary for each light, by the dipole octree (eq. 9;
     Jensen and Buhler 2002).
 
@@ -133,8 +131,8 @@ def total_exitance(
     lights: Lights,
     scene: RayScene,
     *,
-    receivers: NDArray[np.bool_] | None = None,
-) -> NDArray[np.float32]:
+    receivers: Mask | None = None,
+) -> Float32:
     """Sum (v, 3) of `exitances` over the lights; as it is linear, irradiances are
     summed before the traversal.
     """
@@ -145,7 +143,7 @@ def total_exitance(
     )
 
 
-def bounced_exitance(surface: Surface, received: Float) -> Float:
+def bounced_exitance(surface: Surface, received: Array) -> Array:
     """Radiant exitance (v, 3) under the boundary, R_d E', by light E' that other parts of the
     surface reflect with one diffuse bounce.
 
@@ -172,11 +170,11 @@ def tree_opening(error: float | None) -> tuple[float, float]:
 
 def exitance_from_irradiance(
     surface: Surface,
-    received: Float,
-    receivers: NDArray[np.bool_] | None = None,
+    received: Array,
+    receivers: Mask | None = None,
     *,
     tolerance: float = DEFAULT_OPENING,
-) -> NDArray[np.float32]:
+) -> Float32:
     """Radiant exitance (v, 3) under the boundary at the receivers, from
     irradiance (v, 3) under the boundary.
     """
@@ -189,11 +187,11 @@ def exitance_from_irradiance(
 
 def _exitances_from_irradiance(
     surface: Surface,
-    irradiance: Float,
-    receivers: NDArray[np.bool_] | None,
+    irradiance: Array,
+    receivers: Mask | None,
     *,
     tolerance: float = DEFAULT_OPENING,
-) -> NDArray[np.float32]:
+) -> Float32:
     """Exitance (l, v, 3) at the receivers, 0 at the others, from irradiance (v, l)."""
     if surface.s is None or surface.sigma_tr is None:
         raise ValueError(
@@ -224,13 +222,13 @@ class View:
 
     camera: Camera
     samples: int  # rays per pixel and axis
-    pixel: NDArray[np.int64]  # (n,) flat index
-    ray: NDArray[np.int64]  # (n,) which of the pixel's samples**2 rays
-    corners: NDArray[np.int64]  # (n, 3) vertices of the triangle hit
-    barycentric: Float  # (n, 3)
-    position: Float  # (n, 3) mm
-    normal: Float  # (n, 3) unit
-    towards: Float  # (n, 3) unit, to the camera
+    pixel: Index  # (n,) flat index
+    ray: Index  # (n,) which of the pixel's samples**2 rays
+    corners: Index  # (n, 3) vertices of the triangle hit
+    barycentric: Array  # (n, 3)
+    position: Array  # (n, 3) mm
+    normal: Array  # (n, 3) unit
+    towards: Array  # (n, 3) unit, to the camera
 
     @property
     def coverage(self) -> Image:
@@ -246,7 +244,7 @@ class View:
             .reshape(self.camera.height, self.camera.width)
         )
 
-    def shown(self, vertices: int) -> NDArray[np.bool_]:
+    def shown(self, vertices: int) -> Mask:
         """(vertices,) whether a vertex belongs to a triangle that is hit; the others do
         not affect the image.
         """
@@ -254,13 +252,13 @@ class View:
         mask[self.corners] = True
         return mask
 
-    def interpolate(self, values: Float) -> Float:
+    def interpolate(self, values: Array) -> Array:
         """Values (v, c) of the vertices at the hits, (n, c)."""
         return np.asarray(
             np.einsum("nk,nkc->nc", self.barycentric, values[self.corners])
         )
 
-    def image(self, values: Float) -> Image:
+    def image(self, values: Array) -> Image:
         """(h, w, c) means over each pixel's rays of values (n, c) at the hits; rays
         that miss count as 0.
         """
@@ -335,7 +333,7 @@ def trace_view(
     samples: int = 1,
     scene: RayScene | None = None,
     rng: np.random.Generator | None = None,
-    pixels: NDArray[np.bool_] | None = None,
+    pixels: Mask | None = None,
 ) -> View:
     """Trace camera rays through samples x samples sub-pixels.
 
@@ -386,8 +384,8 @@ def trace_view(
 
 
 def _facing_points(
-    surface: Surface, camera: Camera, corners: NDArray[np.int64], weight: Float
-) -> tuple[Float, Float, Float, NDArray[np.bool_]]:
+    surface: Surface, camera: Camera, corners: Index, weight: Array
+) -> tuple[Array, Array, Array, Mask]:
     """Positions, unit normals and directions to the camera (n, 3) of hits, and whether
     the surface and its shading normal face the camera.
     """
@@ -455,17 +453,17 @@ def shade_view(
 
 
 def seen_points(
-    view: View, surface: Surface, diffuse: Float, *, with_surface: bool
+    view: View, surface: Surface, diffuse: Array, *, with_surface: bool
 ) -> Points:
     """The hits of a view, with R_d (n, 3) and the parameters of the surface model."""
-    parameters: Float = np.zeros((len(view.pixel), 0))
+    parameters: Array = np.zeros((len(view.pixel), 0))
     if with_surface:
         parameters = view.interpolate(surface.parameters)
     return Points(view.position, view.normal, view.towards, diffuse, parameters)
 
 
 def polariser_factor(
-    view: View, light: Float, polarisation: float, eta: float
+    view: View, light: Array, polarisation: float, eta: float
 ) -> Image:
     """Factor (h, w, 1) of the surface term by circular polarisers of a light at (3,) and of
     the camera, whose degrees of polarisation have this product.
@@ -481,14 +479,12 @@ def glow_image(view: View, surface: Surface, glow: Image) -> Image:
     return view.image(escape_factor(view, surface.eta) * view.interpolate(glow))
 
 
-def _facet_cosine(
-    surface: Surface, corners: NDArray[np.int64], towards: Float
-) -> Float:
+def _facet_cosine(surface: Surface, corners: Index, towards: Array) -> Array:
     a, b, c = (surface.vertices[corners[:, i]] for i in range(3))
     return np.asarray(np.einsum("nc,nc->n", np.cross(b - a, c - a), towards))
 
 
-def _lamp_points(lights: Lights, i: int, total: int) -> Float:
+def _lamp_points(lights: Lights, i: int, total: int) -> Array:
     """(total, 3) points on the disc of light i with equal areas, in a sunflower
     pattern; one point is the centre.
     """
@@ -505,7 +501,7 @@ def _lamp_points(lights: Lights, i: int, total: int) -> Float:
     return np.asarray(lights.position[i] + radius[:, None] * across)
 
 
-def _lit(scene: RayScene, view: View, lamp: Float) -> NDArray[np.float32]:
+def _lit(scene: RayScene, view: View, lamp: Array) -> Float32:
     """(n, p) 1 where the lamp point is above the horizon of the shading normal and not
     occluded, else 0.
     """
@@ -517,7 +513,7 @@ def _lit(scene: RayScene, view: View, lamp: Float) -> NDArray[np.float32]:
     return np.asarray(above, np.float32)
 
 
-def escape_factor(view: View, eta: float) -> Float:
+def escape_factor(view: View, eta: float) -> Array:
     """(n, 1) F_t(w_o) / pi: radiance towards the camera per radiant exitance under the
     boundary (eq. 9).
     """

@@ -15,9 +15,9 @@ from skindb.reflectance.model import Lamp, Points, ReflectanceModel
 from skindb.render.scene import usable_surfels
 from skindb.schema import FitStatus, TexelStatus, Use, check, names_of, variables
 from skindb.schema.declaration import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
-from skindb.types import Array
+from skindb.types import Array, Bytes, Float32, Index32
 
-Codes = NDArray[np.uint8]
+Codes = Bytes
 STATUS = {FitStatus.FITTED: TexelStatus.MEASURED} | dict.fromkeys(
     (
         FitStatus.DIFFUSE_CLAMPED,
@@ -77,9 +77,9 @@ def surfel_texels(fitted: xr.Dataset) -> Codes:
     return code
 
 
-def surfel_confidence(fitted: xr.Dataset) -> NDArray[np.float32]:
+def surfel_confidence(fitted: xr.Dataset) -> Float32:
     """(n,) 1 for fitted surfels, 0.5 for doubtful fits, 0 for all others."""
-    trust: NDArray[np.float32] = TRUST[surfel_texels(fitted)]
+    trust: Float32 = TRUST[surfel_texels(fitted)]
     if not trust.any():
         rule = "at least one surfel must be fitted for an export"
         raise InputError(
@@ -91,8 +91,8 @@ def surfel_confidence(fitted: xr.Dataset) -> NDArray[np.float32]:
 def texel_codes(
     code: Codes,
     triangles: NDArray[np.integer],
-    face: NDArray[np.int32],
-    weight: NDArray[np.float32],
+    face: Index32,
+    weight: Float32,
 ) -> Codes:
     """(size, size) codes of texels: on the surface that of the nearest surfel; openings
     are holes that it encloses.
@@ -110,9 +110,7 @@ def texel_codes(
     return codes
 
 
-def evaluate(
-    model: xr.DataTree, surfel: int, wi: ArrayLike, wo: ArrayLike
-) -> NDArray[np.float32]:
+def evaluate(model: xr.DataTree, surfel: int, wi: ArrayLike, wo: ArrayLike) -> Float32:
     """BRDF f_r of one surfel, as used in rendering (Weyrich et al. 2005, eq. 1 to 4 and 8).
 
         f_r(wi, wo) = F_t(wi) F_t(wo) R_d / pi + sum_k w_k b_k(theta_h, theta_d, phi_d)
@@ -184,7 +182,7 @@ def evaluate(
 
 def evaluate_error(
     model: xr.DataTree, surfel: int, wi: ArrayLike, wo: ArrayLike
-) -> NDArray[np.float32]:
+) -> Float32:
     """Standard error of `evaluate`, which grows towards directions that nobody measured.
 
     The square root of the sum of the squares of

@@ -12,12 +12,12 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError, input_error
 from skindb.schema.label import label, text_labels
 from skindb.schema.notes import note
 from skindb.schema.variables import VARIABLES
+from skindb.types import AnyArray
 
 TAKE = "take"
 # of a variable of a cohort in one task; maps and samples of takes are larger
@@ -50,7 +50,7 @@ COLUMN = re.compile(
 class Values(NamedTuple):
     """Values of a variable of one take, along its dims."""
 
-    array: NDArray[Any]
+    array: AnyArray
     labels: Mapping[str, Sequence[Any]]  # dim -> labels, if it has some
 
 
@@ -217,7 +217,7 @@ def combine(
     return xr.Dataset(arrays, coords, dict(attrs or {}))
 
 
-def column(values: Sequence[Any]) -> NDArray[Any]:
+def column(values: Sequence[Any]) -> AnyArray:
     """Values of one attribute of takes as an array of numbers, truth values or text;
     NaN where it is missing.
     """
@@ -381,7 +381,7 @@ class Stack:
         """Type of the values."""
         return _absent(self.variable, ()).dtype
 
-    def __getitem__(self, key: tuple[Any, ...]) -> NDArray[Any]:
+    def __getitem__(self, key: tuple[Any, ...]) -> AnyArray:
         first, *others = key
         takes = np.arange(len(self.sources))[first]
         blank = np.broadcast_to(_absent(self.variable, ()), self.size)
@@ -394,7 +394,7 @@ class Stack:
             out[i] = selected(values, others)
         return out if takes.ndim else out[0]
 
-    def _in_layout(self, values: Values) -> NDArray[Any]:
+    def _in_layout(self, values: Values) -> AnyArray:
         """Values of one take in the layout of the cohort."""
         indices: list[list[int]] = []
         extents = zip(
@@ -414,7 +414,7 @@ class Stack:
         return out
 
 
-def selected(values: NDArray[Any], key: Sequence[Any]) -> NDArray[Any]:
+def selected(values: AnyArray, key: Sequence[Any]) -> AnyArray:
     """Values at a slice, index or list of indices along each of the first dims."""
     for dim, index in reversed([*enumerate(key)]):
         values = values[(slice(None),) * dim + (index,)]
@@ -454,7 +454,7 @@ def _lazy(
     return xr.Variable((TAKE, *dims), data, plain.attrs)
 
 
-def _absent(name: str, shape: tuple[int, ...]) -> NDArray[Any]:
+def _absent(name: str, shape: tuple[int, ...]) -> AnyArray:
     spec = VARIABLES[name]
     dtype = np.dtype(spec.dtype)
     return np.full(shape, spec.absent if dtype.kind in "iu" else np.nan, dtype)

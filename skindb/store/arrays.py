@@ -23,6 +23,7 @@ from skindb.schema.label import BLOCK_SURFELS
 from skindb.store.place import Place
 from skindb.store.record import Record
 from skindb.store.verified import VerifiedStore
+from skindb.types import AnyArray
 
 INDEX_BYTES = 16  # of a chunk in the index of a shard: offset and length
 CHECKSUM_BYTES = 4  # after the index; the digests of the file cover it too
@@ -44,7 +45,7 @@ class ShardedArray(BackendArray):
             key, self.shape, indexing.IndexingSupport.OUTER, self._selected
         )
 
-    def _selected(self, key: tuple[Any, ...]) -> NDArray[Any]:
+    def _selected(self, key: tuple[Any, ...]) -> AnyArray:
         """Values at one slice, index or list of indices along each dim."""
         first, *others = key
         if isinstance(first, slice) and first.step in (None, 1):
@@ -55,7 +56,7 @@ class ShardedArray(BackendArray):
         values = selected(values, (slice(None), *others))
         return values[0] if isinstance(first, int | np.integer) else values
 
-    def _listed(self, index: NDArray[np.intp]) -> NDArray[Any]:
+    def _listed(self, index: NDArray[np.intp]) -> AnyArray:
         """Values at these indices along the first dim; each chunk is read once."""
         out = np.empty((len(index), *self.shape[1:]), self.dtype)
         numbers = index // self.chunk
@@ -66,7 +67,7 @@ class ShardedArray(BackendArray):
             out[here] = values[index[here] - begin]
         return out
 
-    def rows(self, begin: int, end: int) -> NDArray[Any]:
+    def rows(self, begin: int, end: int) -> AnyArray:
         """Values from `begin` to `end` along the first dim."""
         out = np.empty((end - begin, *self.shape[1:]), self.dtype)
         while begin < end:
@@ -76,7 +77,7 @@ class ShardedArray(BackendArray):
             begin = stop
         return out
 
-    def _decode(self, number: int, begin: int, end: int, out: NDArray[Any]) -> None:
+    def _decode(self, number: int, begin: int, end: int, out: AnyArray) -> None:
         """Write the values from `begin` to `end`, which are in one object, to `out`."""
         key = f"{self.name}/c/{number}{'/0' * (len(self.shape) - 1)}"
         origin = number * self.shard

@@ -11,7 +11,6 @@ from typing import Any
 import imagecodecs
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.errors import input_error
 from skindb.geometry.mesh import vertex_areas
@@ -26,9 +25,8 @@ from skindb.render.surfels import surfel_confidence, with_matt_surfels
 from skindb.schema import variables
 from skindb.schema.consent import honour_consent
 from skindb.schema.notes import Omission
-from skindb.types import Array, Float32
+from skindb.types import AnyArray, Array, Faces, Float32, Half
 
-Float = Array
 COUNT = 256  # lights, in 64 passes of four
 SKY_ROWS = 32  # rows of the image of the default sky
 GROUND = 0.2  # radiance below the horizon, relative to that of the zenith
@@ -67,8 +65,8 @@ KINDS = {"float16": "f2", "float32": "f4", "uint32": "u4"}
 class DistantLights:
     """Directions of distant lights, and the irradiance of each on a surface that faces it."""
 
-    direction: Float  # (n, 3) unit vectors towards the lights
-    irradiance: Float  # (n, 3)
+    direction: Array  # (n, 3) unit vectors towards the lights
+    irradiance: Array  # (n, 3)
 
 
 def overcast_sky() -> Environment:
@@ -146,7 +144,7 @@ def distant_lights(environment: Environment, count: int = COUNT) -> DistantLight
 
 
 def _halves(
-    bright: Float, region: tuple[int, int, int, int]
+    bright: Array, region: tuple[int, int, int, int]
 ) -> list[tuple[int, int, int, int]]:
     """A region (rows a to b, columns c to d), divided into two parts of equal brightness."""
     a, b, c, d = region
@@ -222,7 +220,7 @@ def face_record(
     values = _values(surface, weights)
     uv = model["fitted"].to_dataset()[variables.SURFEL_UV].values.astype(np.float32)
     tables = _tables(resampled)
-    arrays: dict[str, NDArray[Any]] = {
+    arrays: dict[str, AnyArray] = {
         "position": surface.vertices.astype(np.float32),
         "triangles": np.asarray(surface.faces, np.uint32),
         "normal": surface.normals.astype(np.float16),
@@ -279,7 +277,7 @@ def still_picture(model: xr.DataTree) -> str:
     return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
 
 
-def diffusion_width(s: Float, eta: float) -> Float:
+def diffusion_width(s: Array, eta: float) -> Array:
     """Standard deviation of the Gaussian with the mean square distance of the dipole,
     in units of 1 / sigma_tr.
 
@@ -303,7 +301,7 @@ def diffusion_width(s: Float, eta: float) -> Float:
     return np.asarray(np.sqrt(square / power / 2))
 
 
-def uv_spacing(vertices: Float, faces: NDArray[np.integer[Any]], uv: Float) -> Float:
+def uv_spacing(vertices: Array, faces: Faces, uv: Array) -> Array:
     """Length (n,) [mm] of one unit of the texture coordinates at each vertex."""
     flat = np.concatenate([uv, np.zeros((len(uv), 1))], axis=1)
     square = vertex_areas(vertices, faces) / np.maximum(
@@ -312,7 +310,7 @@ def uv_spacing(vertices: Float, faces: NDArray[np.integer[Any]], uv: Float) -> F
     return np.asarray(np.sqrt(np.clip(square, 1e-6, 1e12)))
 
 
-def _values(surface: Surface, mixed: Float) -> dict[str, Float]:
+def _values(surface: Surface, mixed: Array) -> dict[str, Array]:
     """Values that traits change: albedo (n, 3), weights (n, 4) twice, diffusion length
     (n, 3) [mm].
     """
@@ -331,7 +329,7 @@ def _values(surface: Surface, mixed: Float) -> dict[str, Float]:
     }
 
 
-def _trait(trait: Trait, plain: Mapping[str, Float]) -> dict[str, Any]:
+def _trait(trait: Trait, plain: Mapping[str, Array]) -> dict[str, Any]:
     """Change of the arrays by a trait: differences of weights, log ratios of albedo and
     diffusion length.
     """
@@ -359,7 +357,7 @@ def _trait(trait: Trait, plain: Mapping[str, Float]) -> dict[str, Any]:
     }
 
 
-def _tables(tables: Float32) -> list[NDArray[np.float16]]:
+def _tables(tables: Float32) -> list[Half]:
     """Tables (nh, nd, np, k) as arrays (np, nh, nd, 4), one for every four bases."""
     count = tables.shape[-1]
     padded = np.zeros(
@@ -374,7 +372,7 @@ def _tables(tables: Float32) -> list[NDArray[np.float16]]:
     ]
 
 
-def _quality(model: xr.DataTree, surface: Surface) -> Float:
+def _quality(model: xr.DataTree, surface: Surface) -> Array:
     """Confidence and relative standard error of the albedo (n, 2); an unknown error is 0."""
     fitted = model["fitted"].to_dataset()
     error = np.zeros(len(surface.vertices))
@@ -461,7 +459,7 @@ def _surroundings(
     }
 
 
-def _encode(values: NDArray[Any]) -> dict[str, str]:
+def _encode(values: AnyArray) -> dict[str, str]:
     packed = zlib.compress(np.ascontiguousarray(values).tobytes(), 6)
     return {
         "kind": KINDS[str(values.dtype)],

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import imagecodecs
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.files import make_private, private_file
 from skindb.geometry.camera import pixel_rays
@@ -19,7 +18,7 @@ from skindb.geometry.rays import RayScene
 from skindb.parameters import require_sizes
 from skindb.render.scene import Camera, Lights, Surface
 from skindb.render.shading import exitances, polariser_factor, shade_view, trace_view
-from skindb.types import Float32, Float64
+from skindb.types import Float32, Float64, Values16
 
 CENTRE = np.array([0.0, -8.0, 45.0])  # of the dome in the subject frame, mm
 # mm
@@ -260,7 +259,7 @@ class Sensor:
         *,
         averaged: int = 1,
         rng: np.random.Generator,
-    ) -> NDArray[np.uint16]:
+    ) -> Values16:
         """File values of an image of exposures; with `averaged` > 1 the mean of that
         many frames (finer steps).
         """
@@ -282,7 +281,7 @@ class Sensor:
         )
 
 
-def write_png(path: Path, frame: NDArray[np.uint16]) -> None:
+def write_png(path: Path, frame: Values16) -> None:
     """Write a 16-bit RGB PNG quickly: sensor noise does not compress, so Huffman codes
     of differences are enough.
     """

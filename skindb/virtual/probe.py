@@ -7,15 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.cache import cached_arrays
 from skindb.files import private_file
 from skindb.optics.transport import Walk, radial_profile, random_walk
-from skindb.types import Float64
+from skindb.types import AnyArray, Float64
 from skindb.virtual.dome import Sensor, write_png
 from skindb.virtual.skin import Site
 
@@ -66,7 +64,7 @@ def shared_walk(eta: float, packets: int = PACKETS) -> Walk:
     photons each time.
     """
 
-    def make() -> dict[str, NDArray[Any]]:
+    def make() -> dict[str, AnyArray]:
         return vars(random_walk(packets, eta=eta, rng=np.random.default_rng(WALK_SEED)))
 
     arrays = cached_arrays("probe-walk", (eta, packets), sources=SOURCES, make=make)

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.errors import require
 from skindb.files import make_private, private_umask
@@ -22,7 +21,7 @@ from skindb.parameters import FitParameters, QuickParameters
 from skindb.render.image import write_exr, write_png
 from skindb.schema import FitStatus
 from skindb.store.database import Database
-from skindb.types import Float64, Progress, silent
+from skindb.types import Array, Float64, Progress, silent
 from skindb.workflow.captures import ingest_take
 from skindb.workflow.fit import fit_take
 from skindb.workflow.pictures import view_takes
@@ -115,7 +114,7 @@ def _write_maps(model: xr.DataTree, out: Path, step: int) -> dict[str, Any]:
     width, height = (int(x) // step for x in dome["camera_size"].values[0])
     at = np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
 
-    def grid(values: NDArray[np.floating[Any]]) -> Float64:
+    def grid(values: Array) -> Float64:
         out = np.full((height, width, values.shape[-1]), np.nan)
         out[at] = values
         return out
