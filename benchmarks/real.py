@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -22,12 +22,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from benchmarks.peers import GGX, PEERS, Fit, fit, mixture
+from benchmarks.peers import PEERS, Fit, fit, mixture
 from benchmarks.real_brdfs import brdf_rows
 from benchmarks.real_photographs import (
     Photographs,
     cat,
-    common_gains,
     faces,
     gray_sphere,
     spread_lights,
@@ -38,9 +37,12 @@ from skindb.fit import (
     estimate_light_gains,
     estimate_normals,
     fit_surface,
+    light_residuals,
     refine_jointly,
     refit,
 )
+from skindb.fit.corrections import LightErrors, LightResiduals
+from skindb.fit.rig import Common
 from skindb.optics.angles import half_difference
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.mixture import Mixture
@@ -225,18 +227,54 @@ def own_gains(photographs: Photographs, training: Mask, method: Method | None) -
     return gain
 
 
+def _light_residuals(photographs: Photographs) -> LightResiduals:
+    """What one person says about all lights, with the normals of a first fit."""
+    everything = np.ones(len(photographs.light), np.bool_)
+    samples = samples_of(photographs, np.flatnonzero(everything))
+    normal = skindb_fit(photographs, everything, eta=SKIN).normal
+    known = np.flatnonzero(np.isfinite(normal).all(axis=1))
+    samples = samples.isel(surfel=known)
+    normals = samples["surfel_normal"].copy(data=normal[known])
+    return light_residuals(
+        samples.assign(surfel_normal=normals), rng=np.random.default_rng(2)
+    )
+
+
+def common_lights(
+    person: Photographs,
+    others: Sequence[Photographs],
+    residuals: Sequence[LightResiduals],
+    *,
+    turned: bool,
+) -> Photographs:
+    """A person with the gains, and directions if `turned`, of the lights that others have
+    in common, as by `skindb calibrate --from-takes`.
+    """
+    takes = []
+    for other, residual in zip(others, residuals, strict=True):
+        own = residual.errors(turned=turned)
+        names = list(other.light_name)
+        at = [names.index(name) if name in names else -1 for name in person.light_name]
+        unseen = np.array(at) < 0
+        gain = np.where(unseen, np.nan, own.gain[at])
+        offset = np.where(unseen[:, None], np.nan, own.offset[at])
+        takes.append(LightErrors(gain, offset))
+    common = Common(takes).errors
+    moved = FAR_MM * person.light + common.offset
+    light = moved / np.linalg.norm(moved, axis=1, keepdims=True)
+    return replace(person.divided_by(common.gain), light=light)
+
+
 def face_rows(people: list[Photographs]) -> list[list[str]]:
     """Errors at held-out lights of the faces [%], mean over the people."""
-    rig = [
-        own_gains(person, np.ones(len(person.light), np.bool_), methods(SKIN)[GGX.name])
-        for person in people
-    ]
+    rig = [_light_residuals(person) for person in people]
     title = f"{len(people)} faces: error at held-out lights [%]"
     columns = (
         "raw",
         "scaled",
         "own gains, scaled",
         "gains of others",
+        "gains and directions of others",
         "the same, 8 lights",
     )
     rows = [[title, *columns]]
@@ -247,9 +285,14 @@ def face_rows(people: list[Photographs]) -> list[list[str]]:
             equalised = person.divided_by(
                 own_gains(person, training, None if name == "skindb" else method)
             )
-            shared = person.divided_by(common_gains(people, rig, k))
-            raw, balanced, common = (
-                method(part, training).predicted for part in (person, equalised, shared)
+            others = people[:k] + people[k + 1 :], rig[:k] + rig[k + 1 :]
+            gains, shared = (
+                common_lights(person, *others, turned=turned)
+                for turned in (False, True)
+            )
+            raw, balanced, even, common = (
+                method(part, training).predicted
+                for part in (person, equalised, gains, shared)
             )
             few = method(shared, spread(person, FEW_LIGHTS)).predicted
             cells.append(
@@ -257,6 +300,7 @@ def face_rows(people: list[Photographs]) -> list[list[str]]:
                     prediction_error(person, raw, person.held_out),
                     prediction_error(person, raw, person.held_out, scaled=True),
                     prediction_error(equalised, balanced, person.held_out, scaled=True),
+                    prediction_error(gains, even, person.held_out),
                     prediction_error(shared, common, person.held_out),
                     prediction_error(shared, few, person.held_out),
                 ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -155,24 +154,6 @@ def spread_lights(light: Array, count: int) -> NDArray[np.intp]:
         nearest = (light @ light[chosen].T).max(axis=1)
         chosen.append(int(nearest.argmin()))
     return np.sort(np.array(chosen))
-
-
-def common_gains(
-    people: Sequence[Photographs], gains: Sequence[Array], without: int
-) -> Array:
-    """Gain (light,) of each light of person `without` as the median over the other
-    people; 1 where nobody has it.
-    """
-    result = np.ones(len(people[without].light))
-    for i, name in enumerate(people[without].light_name):
-        gains_of_others = [
-            gain[person.light_name.index(name)]
-            for k, (person, gain) in enumerate(zip(people, gains, strict=True))
-            if k != without and name in person.light_name
-        ]
-        if gains_of_others:
-            result[i] = np.median(gains_of_others)
-    return result
 
 
 def _every_fifth(count: int) -> Mask:

@@ -499,7 +499,7 @@ def rig_positions(rig: xr.Dataset) -> dict[str, Float64]:
 
 
 def rig_dome(dome: DomeRecord, calibration: xr.Dataset, *, where: str) -> DomeRecord:
-    """The dome with the gains of the lights by a calibration from takes.
+    """The dome with the gains and offsets of the lights by a calibration from takes.
 
     Raises
     ------
@@ -517,10 +517,16 @@ def rig_dome(dome: DomeRecord, calibration: xr.Dataset, *, where: str) -> DomeRe
         "other ids or positions of the lights",
         "remove the key calibration of capture.json, or calibrate from takes of this dome",
     )
-    gains = calibration["rig_light_gain"].sel(light=[x.id for x in dome.lights]).values
+    own = calibration.sel(light=[light.id for light in dome.lights])
+    gains, offsets = (own[f"rig_light_{name}"].values for name in ("gain", "offset"))
     lights = (
-        replace(light, gain=float(gain))
-        for light, gain in zip(dome.lights, gains, strict=True)
+        replace(
+            light,
+            gain=float(gain),
+            position=light.position + offset,
+            offset=tuple(offset.tolist()),
+        )
+        for light, gain, offset in zip(dome.lights, gains, offsets, strict=True)
     )
     return replace(dome, lights=tuple(lights))
 

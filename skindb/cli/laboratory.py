@@ -82,7 +82,7 @@ def _ask(site: str, number: int) -> None:
 @click.option(
     "--from-takes",
     is_flag=True,
-    help="Gains of the lights from fitted takes of a rig.  [default: all takes]",
+    help="Errors of the lights from fitted takes of a rig.  [default: all takes]",
 )
 @options_of(CalibrationParameters)
 @common
@@ -100,9 +100,9 @@ def calibrate(
     frames for them exist. If it holds contact/calibration.json, the fibres of the probe
     are located and their gains measured.
 
-    With --from-takes, no set-up is needed: the gains of the lights are what three or
-    more fitted takes have in common. Captures with the same lights use them when they
-    are ingested.
+    With --from-takes, no set-up is needed: the gains and directions of the lights are
+    what three or more fitted takes have in common. Captures with the same lights use
+    them when they are ingested.
 
     The result is a dated version in the database. Captures that name it (format version
     2, key `calibration`) use its newest version when they are ingested. Earlier
@@ -144,12 +144,20 @@ def calibrate(
 
 def _rig_lines(record: Record, report: dict[str, Any]) -> list[str]:
     """What a calibration from takes found, one line each."""
+    misfit = report["misfit"]
     lines = [
         f"{record.take}: calibration {record.generation} of {report['lights']} lights "
         f"from {len(report['takes'])} takes, {record.path}",
         f"  spread of the lights in a held-out take: {report['spread']:.1%} "
         f"without and {report['spread_left']:.1%} with the gains of the others (medians)",
         f"  gains are known to {report['largest_relative_error']:.2%} or better",
+        "  residuals of a held-out take with the gains of the others: "
+        f"{misfit['gains']:.0%} of those without; with their directions, too: "
+        f"{misfit['gains and offsets']:.0%}",
+        f"  directions are moved by {report['angle']:.1f} degrees (rms), known to "
+        f"{report['largest_angle_error']:.1f} or better"
+        if report["angle"]
+        else "  directions are left as stated",
     ]
     if few := report["without_gain"]:
         lines.append(f"  gain 1, as fewer than three takes show them: {', '.join(few)}")

@@ -3,7 +3,7 @@ translucency.
 """
 
 from skindb.fit.albedo import estimate_diffuse_reflectance
-from skindb.fit.corrections import estimate_light_gains
+from skindb.fit.corrections import estimate_light_gains, light_residuals
 from skindb.fit.joint import refine_jointly
 from skindb.fit.kernels import compile_kernels
 from skindb.fit.lumitexels import lumitexels, sample_variance
@@ -46,6 +46,7 @@ __all__ = [
     "fit_probe",
     "fit_surface",
     "held_out_error",
+    "light_residuals",
     "lumitexels",
     "plan_fit",
     "prediction_table",

@@ -4,8 +4,10 @@ parts of the face reflect with one diffuse bounce.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -36,6 +38,10 @@ SMALLEST_SHADING = 0.2
 # other surfaces, with errors of the lights of 0 to 15 %, errors of 0.2 to 2.5 % remain
 # (docs/validation.md).
 PRIOR = 0.03
+# the same of the prior that a light is where it is stated, per rad^2: 0.3 to 1 predict eight
+# faces under strobes within 0.05 points; 0.03 is worse by 0.2, and 2 by 0.15
+PRIOR_TURN = 0.3
+TURN = 1e-3  # rad, for derivatives
 SURFELS_PER_BLOCK = 2048  # whose bounced light is gathered at once
 NEEDED = ("surfel_position", "surfel_normal", "light_position", "camera_position")
 
@@ -81,44 +87,103 @@ def estimate_light_gains(
     >>> rng = np.random.default_rng(0)
     >>> gains = estimate_light_gains(lumitexels(capture), rng=rng)  # doctest: +SKIP
     """
-    names = ("reflectance_sample", *NEEDED)
-    check(lumitexels, names, where="lumitexels")
-    surfels = lumitexels.sizes["surfel"]
-    cameras = lumitexels.sizes["camera"]
-    chosen = np.sort(
-        rng.choice(surfels, min(-(-VIEWS // cameras), surfels), replace=False)
-    )
-    few = lumitexels[list(names)].isel(surfel=chosen).compute()
-    samples = few["reflectance_sample"].values.astype(np.float64).mean(axis=3)
-    matrix = np.zeros((samples.shape[1],) * 2)
-    position, normal, light, camera = (
-        few[name].values.astype(np.float64) for name in names[1:]
-    )
-    to_light = directions(position, light)
-    to_camera = directions(position, camera)
-    lit = cosines(normal, to_light)
-    seen = cosines(normal, to_camera)
-    for i, axes in enumerate(tangent_frames(normal)):
-        shading = _shading(to_light[i] @ axes.T, eta)
-        for c in np.flatnonzero(seen[i] > MIN_COSINE_GAIN):
-            half = (lit[i] + seen[i, c]) / np.linalg.norm(
-                to_light[i] + to_camera[i, c], axis=1
-            )
-            usable = (lit[i] > MIN_COSINE_GAIN) & (
-                half < np.cos(np.radians(MIN_HALF_ANGLE))
-            )
-            _add_view(
-                samples[i, :, c],
-                shading,
-                np.flatnonzero(usable & np.isfinite(samples[i, :, c])),
-                matrix,
-            )
+    light = lumitexels["light_position"].values.astype(np.float64)
+    matrix = _residual_form(lumitexels, [light], rng=rng, eta=eta)
+    gain = _solved(matrix, len(light))[0]
     return dataset(
-        {"light_gain": _gains(matrix, unseen)},
+        {"light_gain": np.where(np.isnan(gain), unseen, gain)},
         coords={"light": lumitexels["light"].values}
         if "light" in lumitexels.coords
         else None,
     )
+
+
+class LightErrors(NamedTuple):
+    """Gains (light,), whose median is 1, and offsets (light, 3) mm of the true from the
+    stated position, across the direction to the light; NaN for unseen lights.
+    """
+
+    gain: Array
+    offset: Array
+
+
+@dataclass(frozen=True)
+class LightResiduals:
+    """Residuals of the samples of a take from functions that are smooth over the dome,
+    by gains and offsets of the lights; see `light_residuals`.
+    """
+
+    form: Array  # (3 light, 3 light), see `_residual_form`
+    axes: Array  # (2, light, 3) mm/rad across the directions to the lights
+    applied: LightErrors  # with which the samples were made
+
+    def of_lights(self, order: list[int]) -> LightResiduals:
+        """The same for the lights in another order."""
+        index = (np.arange(3)[:, None] * len(order) + order).ravel()
+        applied = LightErrors(*(values[order] for values in self.applied))
+        return LightResiduals(
+            self.form[np.ix_(index, index)], self.axes[:, order], applied
+        )
+
+    def errors(self, *, turned: bool) -> LightErrors:
+        """Gains, and offsets if `turned` or else those that were applied, with the
+        smallest residual.
+
+        Lights that are turned together cannot be distinguished from turned normals, nor
+        distances from gains: a prior keeps offsets and gains small.
+        """
+        lights = len(self.applied.gain)
+        form = self.form if turned else self.form[:lights, :lights]
+        gain, *turns = _solved(form, lights)
+        gain = gain * self.applied.gain
+        offset = np.where(np.isnan(gain)[:, None], np.nan, self.applied.offset)
+        if turned:
+            offset = offset + np.einsum("il,ilk->lk", np.array(turns), self.axes)
+        known = gain[np.isfinite(gain)]
+        return LightErrors(gain / np.median(known) if known.size else gain, offset)
+
+    def misfit(self, errors: LightErrors) -> float:
+        """Root of the sum of squared relative residuals with gains and offsets that
+        other takes found; lights of which they know nothing keep those applied.
+        """
+        unseen = np.isnan(errors.gain) | (
+            np.diagonal(self.form)[: len(errors.gain)] == 0
+        )
+        inverse = np.where(unseen, 1.0, self.applied.gain / errors.gain)
+        inverse /= np.median(inverse)
+        move = np.where(unseen[:, None], 0.0, errors.offset - self.applied.offset)
+        square = np.square(self.axes).sum(axis=2)
+        turns = np.einsum("ilk,lk->il", self.axes, move) / square
+        x = np.concatenate([inverse, *turns])
+        return float(np.sqrt(x @ self.form @ x))
+
+
+def light_residuals(
+    lumitexels: xr.Dataset,
+    *,
+    rng: np.random.Generator,
+    eta: float = 1.3,
+    applied: LightErrors | None = None,
+) -> LightResiduals:
+    """What the samples of a take say about gains and offsets of its lights, as in
+    `estimate_light_gains` with two more unknowns for each light.
+
+    Parameters
+    ----------
+    lumitexels, rng, eta
+        See `estimate_light_gains`.
+    applied
+        Gains and offsets of a calibration, with which the samples were made; default
+        none.
+    """
+    light = lumitexels["light_position"].values.astype(np.float64)
+    away = light - lumitexels["surfel_position"].values.mean(axis=0, dtype=np.float64)
+    distance = np.linalg.norm(away, axis=1)[:, None]
+    axes = (tangent_frames(away / distance)[:, :2] * distance[:, None]).swapaxes(0, 1)
+    moved = [light, *(light + TURN * axis for axis in axes)]
+    form = _residual_form(lumitexels, moved, rng=rng, eta=eta)
+    none = LightErrors(np.ones(len(light)), np.zeros((len(light), 3)))
+    return LightResiduals(form, axes, applied or none)
 
 
 def divided_by_gains(lumitexels: xr.Dataset, light_gain: xr.DataArray) -> xr.Dataset:
@@ -145,42 +210,114 @@ def summarise_gains(gains: xr.Dataset) -> dict[str, Any]:
     }
 
 
+def _residual_form(
+    lumitexels: xr.Dataset,
+    lights: Sequence[Array],
+    *,
+    rng: np.random.Generator,
+    eta: float,
+) -> Array:
+    """Squared residuals of smooth functions, as a quadratic form in the inverse gains
+    and in the angles [rad] by which the lights are moved towards further positions.
+
+    Parameters
+    ----------
+    lumitexels, rng, eta
+        See `estimate_light_gains`.
+    lights
+        Stated positions (light, 3), and positions at an angle of `TURN` from them.
+
+    Returns
+    -------
+    ndarray
+        (p light, p light) for p sets of positions.
+    """
+    names = ("reflectance_sample", *NEEDED)
+    check(lumitexels, names, where="lumitexels")
+    surfels = lumitexels.sizes["surfel"]
+    cameras = lumitexels.sizes["camera"]
+    chosen = np.sort(
+        rng.choice(surfels, min(-(-VIEWS // cameras), surfels), replace=False)
+    )
+    few = lumitexels[list(names)].isel(surfel=chosen).compute()
+    samples = few["reflectance_sample"].values.astype(np.float64).mean(axis=3)
+    matrix = np.zeros((len(lights) * samples.shape[1],) * 2)
+    position, normal, _, camera = (
+        few[name].values.astype(np.float64) for name in names[1:]
+    )
+    to_light = directions(position, lights[0])
+    to_camera = directions(position, camera)
+    square = _square_distance(position, lights[0])
+    # direction, and irradiance over that of the stated position
+    moved = [
+        (directions(position, light), square / _square_distance(position, light))
+        for light in lights
+    ]
+    lit = cosines(normal, to_light)
+    seen = cosines(normal, to_camera)
+    for i, axes in enumerate(tangent_frames(normal)):
+        shading = [
+            _shading(towards[i] @ axes.T, eta) * nearer[i, :, None]
+            for towards, nearer in moved
+        ]
+        for c in np.flatnonzero(seen[i] > MIN_COSINE_GAIN):
+            half = (lit[i] + seen[i, c]) / np.linalg.norm(
+                to_light[i] + to_camera[i, c], axis=1
+            )
+            usable = (lit[i] > MIN_COSINE_GAIN) & (
+                half < np.cos(np.radians(MIN_HALF_ANGLE))
+            )
+            _add_view(
+                samples[i, :, c],
+                shading,
+                np.flatnonzero(usable & np.isfinite(samples[i, :, c])),
+                matrix,
+            )
+    return matrix
+
+
 def _add_view(
-    sample: Array, shading: Array, at: NDArray[np.intp], matrix: Array
+    sample: Array, shading: Sequence[Array], at: NDArray[np.intp], matrix: Array
 ) -> None:
-    """Add to `matrix` (light, light) the squared residuals of a smooth function for the
-    samples of lights `at`.
+    """Add to `matrix` the squared residuals of a smooth function for the samples of
+    lights `at`; `shading` (light, SMOOTH) for each set of positions.
     """
     if len(at) < SMOOTH + SPARE:
         return
-    columns = shading[at]
+    columns = shading[0][at]
     seen = sample[at]
-    fitted = columns @ np.linalg.lstsq(columns, seen, rcond=None)[0]
+    smooth = np.linalg.lstsq(columns, seen, rcond=None)[0]
+    fitted = columns @ smooth
     if fitted.min() <= SMALLEST_SHADING * max(np.median(fitted), 0.0):
         return
     ratio = seen / fitted
     if ratio.min() < LOWEST or ratio.max() > HIGHEST:
         return
     q, _ = np.linalg.qr(columns / fitted[:, None])
-    projected = np.diag(ratio) - q @ (q.T * ratio)
-    matrix[np.ix_(at, at)] += projected.T @ projected
+    changes = [ratio, *((fitted - s[at] @ smooth) / fitted / TURN for s in shading[1:])]
+    slope = np.concatenate(
+        [np.diag(change) - q @ (q.T * change) for change in changes], axis=1
+    )
+    lights = len(sample)
+    index = np.concatenate([k * lights + at for k in range(len(shading))])
+    matrix[np.ix_(index, index)] += slope.T @ slope
 
 
-def _gains(matrix: Array, unseen: float) -> Array:
-    """Gains (light,) from the quadratic form (light, light) of the residual in the
-    inverse gains; `unseen` where it has no information.
+def _solved(form: Array, lights: int) -> Array:
+    """Gains, and angles [rad] about each axis of the form, (p, light); NaN where it has
+    no information.
     """
-    information = np.diagonal(matrix)
-    if not (information > 0).any():
-        return np.full(len(matrix), unseen)
-    prior = PRIOR * float(np.median(information[information > 0]))
-    inverse = np.linalg.solve(
-        matrix + prior * np.eye(len(matrix)), np.full(len(matrix), prior)
-    )
-    gain = 1 / inverse
-    return np.asarray(
-        np.where(information > 0, gain / np.median(gain[information > 0]), unseen)
-    )
+    information = np.diagonal(form)[:lights]
+    known = information > 0
+    if not known.any():
+        return np.full((len(form) // lights, lights), np.nan)
+    is_gain = np.arange(len(form)) < lights
+    scale = float(np.median(information[known]))
+    prior = scale * np.where(is_gain, PRIOR, PRIOR_TURN)
+    solved = np.linalg.solve(form + np.diag(prior), is_gain * prior).reshape(-1, lights)
+    gain = 1 / solved[0]
+    solved[0] = gain / np.median(gain[known])
+    return np.where(known, solved, np.nan)
 
 
 def _shading(direction: Array, eta: float) -> Array:

@@ -1,11 +1,13 @@
-"""Gains of the lights of a rig, from all fitted takes of it together."""
+"""Errors of the lights of a rig, from all fitted takes of it together."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
 
-from skindb.fit.corrections import estimate_light_gains
+from skindb.fit.corrections import LightErrors, LightResiduals, light_residuals
 from skindb.fit.lumitexels import lumitexels
 from skindb.numerics.statistics import NORMAL_PER_MEDIAN
 from skindb.schema import dataset, label, variables
@@ -15,42 +17,40 @@ MIN_TAKES = 3  # of a light; the median of two is a mean, which one wrong gain s
 ROUNDS = 3  # in which takes that show different lights are made relative to each other
 # variance of a median over that of a mean, of many normal values
 MEDIAN_VARIANCE = np.pi / 2
+# of the residuals of a held-out take with gains alone: offsets that leave more are not
+# used. 0.95 to 0.96 for three to eight faces under strobes; virtual skin: 0.75 to 0.93 under
+# lights that are 1 degree off, 0.98 to 1.01 under lights that are where they are stated
+MAX_LEFT_BY_OFFSETS = 0.97
 
 
-def take_light_gains(
+def take_light_residuals(
     capture: xr.DataTree, model: xr.DataTree, *, rng: np.random.Generator
-) -> Array:
-    """True over stated intensity (light,) of the lights of a fitted take, see
-    `skindb.fit.estimate_light_gains`; NaN for lights without usable surfels.
-
-    A gain that the capture was ingested with is divided out: the result is relative to
-    the intensities without it.
-    """
+) -> LightResiduals:
+    """What a fitted take says about its lights, see `skindb.fit.light_residuals`."""
     fitted = model["fitted"].to_dataset()
+    dome = capture["dome"].to_dataset()
     normal = fitted[variables.SHADING_NORMAL].values
     rows = np.flatnonzero(np.isfinite(normal).all(axis=1))
-    samples = lumitexels(capture)
-    gain = np.full(samples.sizes["light"], np.nan)
-    if rows.size:
-        samples = samples.isel(surfel=rows).assign(
-            surfel_normal=label("surfel_normal", normal[rows])
-        )
-        eta = float(fitted[variables.REFRACTIVE_INDEX])
-        estimated = estimate_light_gains(samples, rng=rng, eta=eta, unseen=np.nan)
-        gain = estimated[variables.LIGHT_GAIN].values
-    applied = capture["dome"].to_dataset().get(variables.LIGHT_GAIN_APPLIED)
-    return gain if applied is None else gain * applied.values
+    samples = lumitexels(capture).isel(surfel=rows)
+    samples = samples.assign(surfel_normal=label("surfel_normal", normal[rows]))
+    applied = None
+    if variables.LIGHT_GAIN_APPLIED in dome:
+        names = (variables.LIGHT_GAIN_APPLIED, variables.LIGHT_OFFSET_APPLIED)
+        applied = LightErrors(*(dome[name].values for name in names))
+    eta = float(fitted[variables.REFRACTIVE_INDEX])
+    return light_residuals(samples, rng=rng, eta=eta, applied=applied)
 
 
-def common_light_gains(
-    gains: Array, *, lights: list[str], positions: Array
+def common_light_errors(
+    takes: Sequence[LightResiduals], *, lights: list[str], positions: Array
 ) -> xr.Dataset:
-    """Common gains of the lights of a rig, and how well they predict a held-out take.
+    """Gains and offsets of the lights that the takes of a rig have in common, and how
+    well they predict a held-out take.
 
     Parameters
     ----------
-    gains
-        (take, light) from `take_light_gains`; NaN where unknown.
+    takes
+        From `take_light_residuals`, of the same lights.
     lights
         Ids of the lights.
     positions
@@ -59,52 +59,108 @@ def common_light_gains(
     Returns
     -------
     Dataset
-        Group "rig_calibration". The spreads are NaN if no light has three takes.
+        Group "rig_calibration". The spreads are NaN if no light has three takes. Offsets
+        are 0 unless with them the other takes predict a held-out take better than with
+        gains alone.
     """
-    count = np.isfinite(gains).sum(axis=0)
-    shared = count >= MIN_TAKES
-    gain = np.ones(len(lights))
-    error = np.full(len(lights), np.nan)
-    spread = spread_left = np.nan
-    if shared.any():
-        logs = _aligned(np.log(gains[:, shared]))
-        takes = count[shared]
-        others = [
-            np.nanmedian(np.delete(logs, k, axis=0), axis=0) for k in range(len(logs))
-        ]
-        left = logs - np.array(others)
-        deviation = NORMAL_PER_MEDIAN * np.nanmedian(np.abs(left), axis=0)
-        deviation /= np.sqrt(1 + MEDIAN_VARIANCE / (takes - 1))
-        # that of a few takes may be small by chance
-        deviation = np.maximum(deviation, np.median(deviation))
-        gain[shared] = np.exp(np.nanmedian(logs, axis=0))
-        error[shared] = gain[shared] * deviation * np.sqrt(MEDIAN_VARIANCE / takes)
-        spread = _median_spread(logs)
-        spread_left = _median_spread(left)
+    none = LightErrors(np.ones(len(lights)), np.zeros(positions.shape))
+    commons = [Common([take.errors(turned=x) for take in takes]) for x in (False, True)]
+    stated, *left = (
+        np.array([take.misfit(e) for take, e in zip(takes, errors, strict=True)])
+        for errors in ([none] * len(takes), *(common.others for common in commons))
+    )
+    # a take without information has no residual
+    seen = stated > 0
+    misfit = [
+        float(np.median(x[seen] / stated[seen])) if seen.any() else np.nan for x in left
+    ]
+    turned = misfit[1] < MAX_LEFT_BY_OFFSETS * misfit[0]
+    common = commons[turned]
+    gains = commons[0].logs
+    distance = np.linalg.norm(positions, axis=1)
     return dataset(
         {
             variables.RIG_LIGHT_POSITION: positions,
-            variables.RIG_LIGHT_GAIN: gain,
-            variables.RIG_LIGHT_GAIN_ERROR: error,
-            variables.RIG_TAKES: count,
-            variables.RIG_SPREAD: spread,
-            variables.RIG_SPREAD_LEFT: spread_left,
+            variables.RIG_LIGHT_GAIN: common.errors.gain,
+            variables.RIG_LIGHT_GAIN_ERROR: common.errors.gain * common.log_error,
+            variables.RIG_LIGHT_OFFSET: common.errors.offset,
+            variables.RIG_LIGHT_ANGLE_ERROR: np.degrees(common.offset_error / distance)
+            if turned
+            else np.full(len(lights), np.nan),
+            variables.RIG_TAKES: common.takes,
+            variables.RIG_SPREAD: _median_spread(gains),
+            variables.RIG_SPREAD_LEFT: _median_spread(gains - commons[0].others_logs),
+            variables.RIG_MISFIT: misfit,
         },
-        coords={"light": lights, "xyz": ["x", "y", "z"]},
+        coords={
+            "light": lights,
+            "xyz": ["x", "y", "z"],
+            "correction": ["gains", "gains and offsets"],
+        },
     )
 
 
-def _aligned(logs: Array) -> Array:
-    """Logarithms (take, light) of gains of takes with gains, relative to those that all
-    takes have in common: each take may show other lights.
+class Common:
+    """Median of the errors of the lights over takes, that over the others of each take,
+    and their standard errors. Lights of fewer than three takes keep gain 1 and offset 0.
     """
-    known = logs[np.isfinite(logs).any(axis=1)]
-    known = known - np.nanmedian(known, axis=1, keepdims=True)
+
+    def __init__(self, takes: Sequence[LightErrors]) -> None:
+        gains = np.array([take.gain for take in takes])
+        offsets = np.array([take.offset for take in takes])
+        self.takes = np.isfinite(gains).sum(axis=0)
+        shared = self.takes >= MIN_TAKES
+        self.logs = np.full(gains.shape, np.nan)
+        self.others_logs = np.full(gains.shape, np.nan)
+        self.log_error = np.full(len(shared), np.nan)
+        self.offset_error = np.full(len(shared), np.nan)
+        log = np.zeros(len(shared))
+        offset = np.zeros(offsets.shape[1:])
+        others_offset = np.full(offsets.shape, np.nan)
+        if shared.any():
+            self.logs[:, shared] = _aligned(np.log(gains[:, shared]))
+            log[shared], self.others_logs[:, shared], self.log_error[shared] = _medians(
+                self.logs[:, shared]
+            )
+            offset[shared], others_offset[:, shared], error = _medians(
+                offsets[:, shared]
+            )
+            self.offset_error[shared] = np.linalg.norm(error, axis=1)
+        self.errors = LightErrors(np.exp(log), offset)
+        self.others = [
+            LightErrors(*errors)
+            for errors in zip(np.exp(self.others_logs), others_offset, strict=True)
+        ]
+
+
+def _medians(values: Array) -> tuple[Array, Array, Array]:
+    """Median over the takes of values (take, light, ...), that over the others of each
+    take, and the standard error of the former.
+    """
+    takes = np.isfinite(values).sum(axis=0)
+    others = np.array(
+        [np.nanmedian(np.delete(values, k, axis=0), axis=0) for k in range(len(values))]
+    )
+    deviation = NORMAL_PER_MEDIAN * np.nanmedian(np.abs(values - others), axis=0)
+    deviation /= np.sqrt(1 + MEDIAN_VARIANCE / (takes - 1))
+    # that of a few takes may be small by chance
+    deviation = np.maximum(deviation, np.median(deviation, axis=0))
+    error = deviation * np.sqrt(MEDIAN_VARIANCE / takes)
+    return np.nanmedian(values, axis=0), others, error
+
+
+def _aligned(logs: Array) -> Array:
+    """Logarithms (take, light) of gains, relative to those that all takes have in
+    common: each take may show other lights.
+    """
+    known = np.isfinite(logs).any(axis=1)
+    aligned = logs.copy()
+    aligned[known] -= np.nanmedian(logs[known], axis=1, keepdims=True)
     for _ in range(ROUNDS):
-        middle = np.nanmedian(known, axis=0)
+        middle = np.nanmedian(aligned, axis=0)
         middle -= np.median(middle)
-        known = known - np.nanmedian(known - middle, axis=1, keepdims=True)
-    return known
+        aligned[known] -= np.nanmedian(aligned[known] - middle, axis=1, keepdims=True)
+    return aligned
 
 
 def _median_spread(logs: Array) -> float:

@@ -106,8 +106,8 @@ class CameraRecord(Pinhole):
 
 @dataclass(frozen=True)
 class LightRecord:
-    """One light; if its intensity is None, the white target determines it. Either is
-    multiplied by `gain`, which a calibration from takes of the rig found.
+    """One light; if its intensity is None, the white target determines it. A calibration
+    from takes of the rig multiplies either by `gain` and adds `offset` to the position.
     """
 
     id: str
@@ -118,6 +118,7 @@ class LightRecord:
     falloff: float
     polarisation: float = 0.0  # as of a camera, of the light that it sends
     gain: float = 1.0
+    offset: tuple[float, ...] = (0.0, 0.0, 0.0)  # mm
 
 
 @dataclass(frozen=True)

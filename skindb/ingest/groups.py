@@ -109,9 +109,9 @@ def dome_group(dome: DomeRecord, intensity: Float64) -> xr.Dataset:
         "camera_distortion": [camera.distortion for camera in cameras],
         "camera_size": [(camera.width, camera.height) for camera in cameras],
     }
-    gains = [light.gain for light in lights]
-    if any(gain != 1 for gain in gains):
-        variables["light_gain_applied"] = gains
+    if any(light.gain != 1 for light in lights):
+        variables["light_gain_applied"] = [light.gain for light in lights]
+        variables["light_offset_applied"] = [light.offset for light in lights]
     by_light = [light.polarisation for light in lights]
     by_camera = [camera.polarisation for camera in cameras]
     if any(by_light) and any(by_camera):

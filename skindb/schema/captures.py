@@ -166,6 +166,10 @@ LIGHT_GAIN_APPLIED = declare(
     "float64 dome/light_gain_applied(light) [1]",
     "gain by a calibration from takes, by which the intensity was multiplied; 1 if absent",
 )
+LIGHT_OFFSET_APPLIED = declare(
+    "float64 dome/light_offset_applied(light, xyz) [mm]",
+    "offset by a calibration from takes, which was added to the position; 0 if absent",
+)
 LIGHT_POLARISATION = declare(
     "float32 dome/light_polarisation(light) [1]",
     "degree of circular polarisation, 1 right-handed, -1 left-handed, 0 without "
@@ -274,9 +278,18 @@ RIG_LIGHT_GAIN_ERROR = declare(
     "its standard error by the scatter of the takes; NaN for lights of fewer than three "
     "takes",
 )
+RIG_LIGHT_OFFSET = declare(
+    "float64 rig_calibration/rig_light_offset(light, xyz) [mm]",
+    "true minus stated position across the direction to the light, median over the "
+    "takes; 0 if those of other takes do not predict a take",
+)
+RIG_LIGHT_ANGLE_ERROR = declare(
+    "float64 rig_calibration/rig_light_angle_error(light) [degree]",
+    "standard error of the direction by the scatter of the takes; NaN without an offset",
+)
 RIG_TAKES = declare(
     "int32 rig_calibration/rig_takes(light) [1]",
-    "takes in which the gain could be estimated",
+    "takes in which the light could be estimated",
 )
 RIG_SPREAD = declare(
     "float64 rig_calibration/rig_spread() [1]",
@@ -286,6 +299,11 @@ RIG_SPREAD = declare(
 RIG_SPREAD_LEFT = declare(
     "float64 rig_calibration/rig_spread_left() [1]",
     "the same after division by the common gains of the other takes",
+)
+RIG_MISFIT = declare(
+    "float64 rig_calibration/rig_misfit(correction) [1]",
+    "rms residual of a held-out take with the gains, and the gains and offsets, of the "
+    "other takes, over that without; median of the takes",
 )
 
 # probe_calibration

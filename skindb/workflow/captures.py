@@ -333,7 +333,7 @@ def calibrated_capture(db: Database, capture: Capture) -> Capture:
         rigs = rigs_of(db, dome)
         if len(rigs) > 1:
             line = (
-                f"gains of the lights: calibrations {' and '.join(rigs)} have the same "
+                f"errors of the lights: calibrations {' and '.join(rigs)} have the same "
                 "lights; name one in capture.json"
             )
             return replace(capture, skipped=(*capture.skipped, line))

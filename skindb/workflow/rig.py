@@ -10,7 +10,8 @@ import xarray as xr
 
 from skindb.calibration.lights import is_same_rig
 from skindb.errors import input_error, require
-from skindb.fit.rig import MIN_TAKES, common_light_gains, take_light_gains
+from skindb.fit.corrections import LightResiduals
+from skindb.fit.rig import MIN_TAKES, common_light_errors, take_light_residuals
 from skindb.format.fields import NAME
 from skindb.schema import variables
 from skindb.store import CALIBRATION, Database, Record, require_text
@@ -28,11 +29,11 @@ def calibrate_rig(
     seed: int = 0,
     progress: Progress = silent,
 ) -> Record:
-    """Estimate the gains of the lights that all takes of a rig have in common, and commit
-    them as the next version of the calibration of that name.
+    """Estimate the errors of intensity and direction of the lights that all takes of a rig
+    have in common, and commit them as the next version of the calibration of that name.
 
     A take that is ingested later without the name of a calibration, with the same lights,
-    uses them. Gains with which the takes themselves were ingested are divided out.
+    uses them. What the takes themselves were ingested with is taken into account.
 
     Parameters
     ----------
@@ -71,10 +72,10 @@ def calibrate_rig(
         "ingest and fit more takes of the rig",
     )
     inputs = list[Record]()
-    gains = list[Any]()
+    residuals = list[LightResiduals]()
     positions = dict[str, Float64]()
     for number, (take, model) in enumerate(models.items()):
-        progress("gains", number, len(models))
+        progress("lights", number, len(models))
         capture = db.read("capture", take)
         record = db.record("capture", take, capture.attrs["generation"])
         lights = _lights(record, capture)
@@ -82,14 +83,14 @@ def calibrate_rig(
         _require_rig(positions, lights, take=take, first=next(iter(models)))
         rng = np.random.default_rng([seed, number])
         fitted = db.read("model", take, generation=model.generation)
-        own = dict(zip(lights, take_light_gains(capture, fitted, rng=rng), strict=True))
-        gains.append([own[light] for light in positions])
+        own = take_light_residuals(capture, fitted, rng=rng)
+        residuals.append(own.of_lights([[*lights].index(name) for name in positions]))
         inputs += [record, model]
-    group = common_light_gains(
-        np.array(gains), lights=[*positions], positions=np.array([*positions.values()])
+    group = common_light_errors(
+        residuals, lights=[*positions], positions=np.array([*positions.values()])
     )
     _require_help(group)
-    progress("gains", len(models), len(models))
+    progress("lights", len(models), len(models))
     provenance = {
         "command": "calibrate",
         "parameters": {"takes": [*models]},
@@ -103,19 +104,31 @@ def calibrate_rig(
 
 
 def describe_rig(db: Database, record: Record) -> dict[str, Any]:
-    """Gains of a calibration from takes: their spread, errors, and the spread that they
-    leave in a held-out take.
+    """Gains and directions of a calibration from takes: their spread, errors, and the
+    spread that they leave in a held-out take.
     """
     stored = db.read(CALIBRATION, record.take, generation=record.generation)
     rig = stored[RIG].to_dataset().load()
     count = rig[variables.RIG_TAKES].values
     few = rig["light"].values[count < MIN_TAKES]
+    position = rig[variables.RIG_LIGHT_POSITION].values
+    turns = rig[variables.RIG_LIGHT_OFFSET].values
+    turns = turns / np.linalg.norm(position, axis=1, keepdims=True)
     return {
         "lights": rig.sizes["light"],
         "takes": record.provenance["parameters"]["takes"],
         "largest_relative_error": float(rig[variables.RIG_LIGHT_GAIN_ERROR].max()),
         "spread": float(rig[variables.RIG_SPREAD]),
         "spread_left": float(rig[variables.RIG_SPREAD_LEFT]),
+        "misfit": dict(
+            zip(
+                rig["correction"].values.tolist(),
+                rig[variables.RIG_MISFIT].values.tolist(),
+                strict=True,
+            )
+        ),
+        "angle": float(np.degrees(np.sqrt(np.square(turns).sum(axis=1).mean()))),
+        "largest_angle_error": float(rig[variables.RIG_LIGHT_ANGLE_ERROR].max()),
         "without_gain": [str(light) for light in few],
         "ingest_again": takes_of_earlier(db, record),
     }
@@ -144,7 +157,7 @@ def _models(db: Database, takes: Sequence[str]) -> dict[str, Record]:
 
 
 def _lights(record: Record, capture: xr.DataTree) -> dict[str, Float64]:
-    """Position (3,) mm of each light of a capture, whose intensities must be its own."""
+    """Stated position (3,) mm of each light of a capture, whose intensities must be its own."""
     take = record.take
     rule = "a calibration from takes needs captures with a dome"
     require("dome" in capture.children, take, rule, "none", "name other takes")
@@ -161,6 +174,8 @@ def _lights(record: Record, capture: xr.DataTree) -> dict[str, Float64]:
         "name other takes",
     )
     positions = dome[variables.LIGHT_POSITION].values.astype(np.float64)
+    if variables.LIGHT_OFFSET_APPLIED in dome:
+        positions = positions - dome[variables.LIGHT_OFFSET_APPLIED].values
     return dict(zip(map(str, dome["light"].values), positions, strict=True))
 
 

@@ -38,24 +38,6 @@ def test_fit__recovers_planted_normals_and_unseen_lights():
         )
 
 
-def test_common_gains__leaves_the_person_out():
-    people = [
-        real_photographs.Photographs(
-            name="p",
-            sample=np.ones((1, 2, 1)),
-            usable=np.ones((1, 2), bool),
-            light=np.eye(3)[:2],
-            light_name=names,
-            held_out=np.zeros(2, bool),
-        )
-        for names in (("a", "b"), ("b", "a"), ("a", "c"))
-    ]
-    gains = [np.array([9.0, 9.0]), np.array([2.0, 3.0]), np.array([5.0, 7.0])]
-    np.testing.assert_array_equal(
-        real_photographs.common_gains(people, gains, 0), [4.0, 2.0]
-    )
-
-
 def test_spread_lights__are_apart_and_begin_in_front():
     light = _lights()
     chosen = light[real_photographs.spread_lights(light, 4)]

@@ -51,6 +51,7 @@ ABSENT = (
     "camera_polarisation",
     "relative_reflectance",
     "light_gain_applied",
+    "light_offset_applied",
 )
 
 
