@@ -77,8 +77,13 @@ def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
         If the cohort has no take.
     """
     require_takes(cohort, "tables")
-    rule = "the cohort must have a take"
-    require(cohort.sizes["take"], "coverage", rule, "none", "fit a take first")
+    require(
+        cohort.sizes["take"],
+        "coverage",
+        "the cohort must have a take",
+        "none",
+        "fit a take first",
+    )
     takes = subjects_of(cohort)
     subjects = takes.names
     stated = {

@@ -264,13 +264,13 @@ def trait_of(subjects: Subjects, name: str) -> str:
     try:
         return trait_name(name, traits)
     except InputError as error:
-        cure = (
-            f"choose from the attributes: {', '.join(sorted(subjects.attributes))}; "
-            f"traits: {', '.join(traits) or 'none'}"
-        )
         finding = error.faults[0].found
         raise input_error(
-            f"group by {name}", "must be an attribute or a trait", finding, cure
+            f"group by {name}",
+            "must be an attribute or a trait",
+            finding,
+            f"choose from the attributes: {', '.join(sorted(subjects.attributes))}; "
+            f"traits: {', '.join(traits) or 'none'}",
         ) from None
 
 

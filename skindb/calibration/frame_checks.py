@@ -164,11 +164,6 @@ def disagreement(
     place: str, exposures: Sequence[ComparedExposure], sensor: SensorRecord
 ) -> Fault | None:
     """Fault of two neighbouring exposures of a view with different radiance."""
-    rule = (
-        "exposures of one view must have the same radiance: check seconds, "
-        "black_level and response"
-    )
-    cure = "assign the correct seconds and frames to each exposure"
     ordered = sorted(exposures, key=lambda exposure: exposure.seconds)
     for short, long in pairwise(ordered):
         ratio, apart = _radiance_ratio(sensor, short, long)
@@ -184,7 +179,13 @@ def disagreement(
                 f"{short.name} and {long.name} differ in {apart:.0%} of the values that "
                 "both must contain"
             )
-        return Fault(place, rule, finding, cure)
+        return Fault(
+            place,
+            "exposures of one view must have the same radiance: check seconds, "
+            "black_level and response",
+            finding,
+            "assign the correct seconds and frames to each exposure",
+        )
     return None
 
 
@@ -256,11 +257,13 @@ def _below_fault(
             if dark:
                 reference = "the dark frame"
                 cure = "take the dark frames again, with the exposures of the face"
-            rule = (
+            return Fault(
+                place,
                 f"at most {MAX_BELOW_FRACTION:.0%} of a frame may be darker than "
-                f"{reference}, beyond noise"
+                f"{reference}, beyond noise",
+                f"{below:.0%} of exposure {exposure.name}",
+                cure,
             )
-            return Fault(place, rule, f"{below:.0%} of exposure {exposure.name}", cure)
     return None
 
 
@@ -407,14 +410,17 @@ def repeated_frame_faults(
     alike = dict[str, list[Path]]()
     for path in sorted(digests.keys() - set(besides)):
         alike.setdefault(digests[path], []).append(path)
-    rule = "every frame must have been taken by itself"
-    cure = "copy the right frames from the camera again"
     faults = []
     for paths in alike.values():
         if len(paths) > 1 and np.ptp(read_frame(paths[0])) > 0:
             copy, original = (path.relative_to(folder) for path in paths[:2])
             faults.append(
-                Fault(str(folder), rule, f"{copy} is a copy of {original}", cure)
+                Fault(
+                    str(folder),
+                    "every frame must have been taken by itself",
+                    f"{copy} is a copy of {original}",
+                    "copy the right frames from the camera again",
+                )
             )
     return faults
 

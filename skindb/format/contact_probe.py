@@ -276,14 +276,11 @@ def _require_separate_discs(fields: Fields, centre: Float64, radius: Float64) ->
     closeness[np.tril_indices(len(radius))] = np.inf
     if count := int((closeness < 1).sum()):
         i, j = np.unravel_index(closeness.argmin(), closeness.shape)
-        finding = (
-            f"{count} pairs, such as {i} and {j}: {gap[i, j]:.3g} px apart, radii "
-            f"{radius[i]:g} and {radius[j]:g} px"
-        )
         fields.fault(
             "fibres",
             "fibres must not overlap in the picture",
-            finding,
+            f"{count} pairs, such as {i} and {j}: {gap[i, j]:.3g} px apart, radii "
+            f"{radius[i]:g} and {radius[j]:g} px",
             "correct centre and radius, in pixels",
         )
 

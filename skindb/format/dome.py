@@ -221,9 +221,12 @@ def read_dome(
         white = _white(fields.object("white"), {c.id for c in cameras}, several)
     elif unknown:
         if not calibrated and len(unknown) < len(lights):
-            rule = "all lights need an intensity, or a white target, or none has one"
-            finding = f"{len(unknown)} lights without intensity, first {unknown[0]}"
-            fields.fault("white", rule, finding, "measure one of them")
+            fields.fault(
+                "white",
+                "all lights need an intensity, or a white target, or none has one",
+                f"{len(unknown)} lights without intensity, first {unknown[0]}",
+                "measure one of them",
+            )
         # unless a calibration has intensities
         relative = True
     # version 1 keeps the sequence as an unchecked attribute
@@ -327,14 +330,11 @@ def _require_light(
     gain = 1 + r2 * (vignette[0] + r2 * (vignette[1] + r2 * vignette[2]))
     if ((gain > MIN_VIGNETTE_GAIN) & (gain <= MAX_VIGNETTE_GAIN)).all():
         return
-    rule = (
-        f"1 + a2 r^2 + a4 r^4 + a6 r^6 must be above {MIN_VIGNETTE_GAIN:g} and "
-        f"at most {MAX_VIGNETTE_GAIN:g} in the whole picture"
-    )
     worst = gain.argmax() if gain.max() > MAX_VIGNETTE_GAIN else gain.argmin()
     item.fault(
         "vignette",
-        rule,
+        f"1 + a2 r^2 + a4 r^4 + a6 r^6 must be above {MIN_VIGNETTE_GAIN:g} and "
+        f"at most {MAX_VIGNETTE_GAIN:g} in the whole picture",
         f"{gain[worst]:.3g} at r = {np.sqrt(r2[worst]):.3g}",
         "r is 1 at half the image diagonal; measure the lens up to the corners",
     )
@@ -346,8 +346,12 @@ def _light(item: Fields) -> LightRecord:
         item.fault("intensity", "must be positive", shown(intensity))
     if item.has("direction"):
         if item.has("position"):
-            rule = "a light has a position or a direction"
-            item.fault("direction", rule, "both", "remove the direction")
+            item.fault(
+                "direction",
+                "a light has a position or a direction",
+                "both",
+                "remove the direction",
+            )
         position = DISTANT_MM * _direction(item, "direction")
         # given as irradiance of a surface that faces the light
         intensity = None if intensity is None else DISTANT_MM**2 * intensity
@@ -535,13 +539,10 @@ def _require_distortion(item: Fields, lens: Float64, K: Float64, size: Float64) 
     smallest, largest = RADIAL_FACTORS
     if smallest <= radial <= largest and tangential <= MAX_TANGENTIAL:
         return
-    rule = (
-        f"1 + k1 r^2 + k2 r^4 + k3 r^6 must be {smallest:g} to {largest:g}, and 3 |p| r at "
-        f"most {MAX_TANGENTIAL:g}, at the corners of the picture"
-    )
     item.fault(
         "distortion",
-        rule,
+        f"1 + k1 r^2 + k2 r^4 + k3 r^6 must be {smallest:g} to {largest:g}, and 3 |p| r at "
+        f"most {MAX_TANGENTIAL:g}, at the corners of the picture",
         f"{radial:.3g} and {tangential:.3g} at r = {np.sqrt(r2):.3g}",
         "the order is k1, k2, p1, p2, k3, of distances over the focal length",
     )

@@ -334,12 +334,12 @@ class _Reader:
         for key in OVERRIDE:
             value = override.get(key)
             if value is not None and value is not True:
-                cure = (
-                    "a subject who was not screened must not be photographed above 3 "
-                    "flashes per second"
-                )
                 override.fault(
-                    key, "must be true: the operator confirmed it", shown(value), cure
+                    key,
+                    "must be true: the operator confirmed it",
+                    shown(value),
+                    "a subject who was not screened must not be photographed above 3 "
+                    "flashes per second",
                 )
         return {**override.data, "operator": operator, "time": time}
 
@@ -376,12 +376,13 @@ class _Reader:
         """Without a scan, the surface is estimated from the photographs of one camera."""
         cameras = 0 if self.dome is None else len(self.dome.cameras)
         if cameras != 1 and not self.faults:
-            rule = "a capture needs a scan, unless one camera photographed the face"
-            cure = (
+            self.fields.fault(
+                "mesh",
+                "a capture needs a scan, unless one camera photographed the face",
+                f"no scan, {cameras} cameras",
                 "scan the face, or reconstruct it from the photographs of all cameras with "
-                "a program for photogrammetry such as COLMAP or Meshroom; or keep one camera"
+                "a program for photogrammetry such as COLMAP or Meshroom; or keep one camera",
             )
-            self.fields.fault("mesh", rule, f"no scan, {cameras} cameras", cure)
         self.skipped.append(
             "mesh: not in capture.json; the surface is estimated from the shading, and its "
             "normals are no prior"

@@ -152,8 +152,12 @@ def _file_header(path: Path) -> Header:
             return _header(path, stream)
     except OSError as error:
         finding = error.strerror or str(error)
-        cure = "check its permissions and the disk"
-        fault = Fault(str(path), "a frame must be readable", finding, cure)
+        fault = Fault(
+            str(path),
+            "a frame must be readable",
+            finding,
+            "check its permissions and the disk",
+        )
         raise InputError(fault) from None
 
 

@@ -134,14 +134,11 @@ def face_faults(where: str, points: Mapping[str, Float64]) -> list[Fault]:
     smallest, largest = FACE_HEIGHTS
     if height is None or smallest <= height <= largest:
         return []
-    rule = (
-        f"lengths must be in mm, and a face must be {smallest:g} to {largest:g} mm from "
-        "brows and eyes to mouth and chin"
-    )
     return [
         Fault(
             where,
-            rule,
+            f"lengths must be in mm, and a face must be {smallest:g} to {largest:g} mm from "
+            "brows and eyes to mouth and chin",
             f"{height:.3g} mm",
             f"{rescaling(likely_unit(height, FACE_HEIGHT))}, also for the scan",
         )
@@ -187,15 +184,12 @@ def discarded_piece_faults(
     distant = [name for name, d in distances.items() if d > LANDMARK_REACH]
     if not distant:
         return []
-    finding = (
-        f"{len(distant)} of {len(points)} up to {max(distances.values()):.0f} mm from "
-        f"it, such as {distant[0]}"
-    )
     return [
         Fault(
             where,
             "landmarks must lie on the largest component of the scan, which is kept",
-            finding,
+            f"{len(distant)} of {len(points)} up to {max(distances.values()):.0f} mm from "
+            f"it, such as {distant[0]}",
             "remove everything from the scan that does not belong to this face",
         )
     ]
@@ -587,9 +581,14 @@ def dome_unit_faults(
         ]
     if span < (LEAST_SPAN if diagonal > FACE_DIAGONAL else PATCH_SPAN):
         cure = rescaling(likely_unit(USUAL_SPAN / span, 1.0))
-        rule = "lengths must be in mm, and the scan must be visible in the pictures"
-        finding = f"{diagonal:,.0f} mm across, it spans {span:.2%} of a picture's side"
-        return [Fault(where, rule, finding, cure)]
+        return [
+            Fault(
+                where,
+                "lengths must be in mm, and the scan must be visible in the pictures",
+                f"{diagonal:,.0f} mm across, it spans {span:.2%} of a picture's side",
+                cure,
+            )
+        ]
     return []
 
 

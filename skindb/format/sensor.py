@@ -156,11 +156,10 @@ def _require_ends(
     slack = RESPONSE_ERROR * (white - black)
     covers = table[0, 0] <= black + slack and table[-1, 0] >= white - slack
     if not covers or (np.abs(ends - [0.0, 1.0]) > RESPONSE_ERROR).any():
-        rule = f"must run from 0 at black_level {black:g} to 1 at white_level {white:g}"
         (low, *dimmest), (high, *brightest) = table[0], table[-1]
         item.fault(
             "response",
-            rule,
+            f"must run from 0 at black_level {black:g} to 1 at white_level {white:g}",
             f"{name}: {min(dimmest):.3g} at {low:g} to {max(brightest):.3g} at {high:g}",
             "measure it over all values, and divide it by that at the white level",
         )

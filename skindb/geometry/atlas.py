@@ -122,10 +122,14 @@ def disc_atlas(
                 report = {"area_log2_sd": spread, "intrinsic": float(intrinsic)}
                 return stored, {"flips": 0.0, **report}
             fewest_flips = min(fewest_flips, flips)
-    rule = "no triangle may be turned over in the atlas"
-    cure = "remove the smallest triangles from the scan, or choose a wider spacing"
-    finding = f"{fewest_flips} of {len(fine)}"
-    raise InputError(Fault("mesh", rule, finding, cure))
+    raise InputError(
+        Fault(
+            "mesh",
+            "no triangle may be turned over in the atlas",
+            f"{fewest_flips} of {len(fine)}",
+            "remove the smallest triangles from the scan, or choose a wider spacing",
+        )
+    )
 
 
 @dataclass(frozen=True)
@@ -162,8 +166,9 @@ def _check(n: int, faces: Index, loops: list[Index]) -> None:
         raise InputError(Fault("mesh", rule, "a closed surface", cure))
     if len(np.unique(faces)) != n or face_components(faces).max() > 0:
         rule = "a surface must be connected to be flattened"
-        finding = "several components or unused vertices"
-        raise InputError(Fault("mesh", rule, finding, "clean it"))
+        raise InputError(
+            Fault("mesh", rule, "several components or unused vertices", "clean it")
+        )
     handles = (2 - len(loops) - (n - len(edge_table(faces).edges) + len(faces))) // 2
     if handles:
         rule = "a surface must not have handles to be flattened"

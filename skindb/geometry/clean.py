@@ -149,9 +149,14 @@ def clean_mesh(
     report.add("slivers_left", points, remaining)
     current = _largest_component(points, current, report)
     if not len(current):
-        rule = "a scan must have a surface"
-        finding = "no non-degenerate face"
-        raise InputError(Fault("mesh", rule, finding, "export it again"))
+        raise InputError(
+            Fault(
+                "mesh",
+                "a scan must have a surface",
+                "no non-degenerate face",
+                "export it again",
+            )
+        )
     current = _fill_small_holes(points, current, hole_edges, report)
     current, source = _split_bow_ties(current, len(points))
     report.add("bow_ties", points, source[len(points) :, None])

@@ -143,9 +143,10 @@ def _faults(file: str, vertices: Array, faces: Index) -> list[Fault]:
         faults.append(Fault(file, "vertices must be finite numbers", finding, CURE))
     wrong = np.flatnonzero(((faces < 0) | (faces >= len(vertices))).any(axis=1))
     if len(wrong):
-        rule = "faces must refer to vertices of the file"
         finding = f"{len(wrong)} other faces, first face {wrong[0]}, for {len(vertices)} vertices"
-        faults.append(Fault(file, rule, finding, CURE))
+        faults.append(
+            Fault(file, "faces must refer to vertices of the file", finding, CURE)
+        )
     return faults
 
 
@@ -272,13 +273,15 @@ class Crop:
         """Check that the limits are not empty."""
         is_box = self.low is not None and self.high is not None
         if is_box and not np.less(np.array(self.low), np.array(self.high)).all():
-            finding = f"{self.low} and {self.high}"
             rule = "its lower corner must lie below the higher one, in mm"
-            raise InputError(Fault("crop", rule, finding, "exchange them"))
+            raise InputError(
+                Fault("crop", rule, f"{self.low} and {self.high}", "exchange them")
+            )
         if self.reach_mm is not None and not self.reach_mm > 0:
             rule = "its reach must be positive, in mm"
-            cure = "give a positive one"
-            raise InputError(Fault("crop", rule, str(self.reach_mm), cure))
+            raise InputError(
+                Fault("crop", rule, str(self.reach_mm), "give a positive one")
+            )
 
 
 def crop_faces(

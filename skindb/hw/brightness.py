@@ -345,13 +345,10 @@ def _require_visible(dome: Dome, cameras: Cameras, setup: Setup, stated: int) ->
     level = dark_levels(schedule, levels, setup.dome)
     filled = [name for name in level if not level[name] <= MAX_FILLED_LEVEL]
     if filled:
-        rule = (
-            "must leave room for a light in every exposure, at most "
-            f"{MAX_FILLED_LEVEL:.0%} of white"
-        )
         raise input_error(
             "steady lamp",
-            rule,
+            "must leave room for a light in every exposure, at most "
+            f"{MAX_FILLED_LEVEL:.0%} of white",
             f"a dark frame of {level[filled[0]]:.0%} in exposure {filled[0]}",
             "shorten that exposure in dome.json, or make the lamp darker",
         )

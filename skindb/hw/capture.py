@@ -94,13 +94,10 @@ def planned_schedule(setup: Setup, plan: CapturePlan) -> Schedule:
         schedule = slowed_schedule(schedule)
         shortest = slowed_schedule(plan_schedule(setup.lights, setup.exposures)).seconds
         if plan.seconds is not None and plan.seconds < shortest:
-            rule = (
-                f"with at most {MAX_FLASHES} flashes in a second the sequence lasts at "
-                f"least {shortest:.1f} s"
-            )
             raise input_error(
                 "sequence",
-                rule,
+                f"with at most {MAX_FLASHES} flashes in a second the sequence lasts at "
+                f"least {shortest:.1f} s",
                 f"{plan.seconds:g} s",
                 "allow more time, or omit --slower",
             )

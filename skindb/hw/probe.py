@@ -259,9 +259,12 @@ class Probe:
                 gauge.settled = True
                 return
             if self.link.clock.monotonic() > deadline:
-                rule = f"must reach {pressure:g} kPa within {SETTLE_SECONDS:g} s"
-                cure = "check its seal and the pump, and place it again"
-                fault = Fault(self.link.name, rule, f"{gauge.kpa:.2f} kPa", cure)
+                fault = Fault(
+                    self.link.name,
+                    f"must reach {pressure:g} kPa within {SETTLE_SECONDS:g} s",
+                    f"{gauge.kpa:.2f} kPa",
+                    "check its seal and the pump, and place it again",
+                )
                 raise PlacementError(fault)
             self.link.request("BEAT")
             self.link.clock.sleep(POLL_SECONDS)

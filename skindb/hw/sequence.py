@@ -340,13 +340,12 @@ def rehearsal_notes(schedule: Schedule, rehearsal: Rehearsal) -> list[str]:
 
 
 def _flash_fault(schedule: Schedule, assessment: Assessment) -> Fault:
-    rule = (
-        "an operator must confirm screening, consent and closed eyes for more than "
-        f"{MAX_FLASHES} flashes in a second"
-    )
     longer = assess(slowed_schedule(schedule)).seconds - assessment.seconds
-    cure = (
+    return Fault(
+        "sequence",
+        "an operator must confirm screening, consent and closed eyes for more than "
+        f"{MAX_FLASHES} flashes in a second",
+        str(assessment),
         f"give --confirm-screening --operator ID, or --slower ({longer:.1f} s longer), "
-        "or a steady lamp (see --plan)"
+        "or a steady lamp (see --plan)",
     )
-    return Fault("sequence", rule, str(assessment), cure)

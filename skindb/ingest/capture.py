@@ -359,9 +359,14 @@ class _DomeStages:
             levels = lumitexels.views
             self.run.faults += sample_faults(self.dome, levels.median, levels.bright)
         if not lumitexels.view_count.any():
-            rule = "a surfel must be lit by a light and seen by a camera"
-            cure = "check the crop, poses and positions"
-            self.run.faults.append(Fault("samples", rule, "none is", cure))
+            self.run.faults.append(
+                Fault(
+                    "samples",
+                    "a surfel must be lit by a light and seen by a camera",
+                    "none is",
+                    "check the crop, poses and positions",
+                )
+            )
         if self.run.faults:
             return {}
         self._note(lumitexels, mergers, intensity)

@@ -181,10 +181,14 @@ def calibration_faults(dome: DomeRecord, calibration: Calibration) -> list[Fault
     faults = [*_camera_faults(dome, calibration)]
     checked = int(np.isfinite(calibration.camera_agreement).sum())
     if len(faults) == checked > 1 and not calibration.explanations:
-        rule = f"the photographs must show the face within {MAX_OFFSET_MM:g} mm of the scan"
-        finding = f"none of {checked} cameras does"
-        cure = f"align the scan: {_pose(calibration)}"
-        faults = [Fault(str(dome.file), rule, finding, cure)]
+        faults = [
+            Fault(
+                str(dome.file),
+                f"the photographs must show the face within {MAX_OFFSET_MM:g} mm of the scan",
+                f"none of {checked} cameras does",
+                f"align the scan: {_pose(calibration)}",
+            )
+        ]
     faults = faults or [*_light_faults(dome, calibration)]
     return [
         *faults,
@@ -354,7 +358,6 @@ def _light_notes(dome: DomeRecord, calibration: Calibration) -> Iterator[str]:
 
 def _camera_faults(dome: DomeRecord, calibration: Calibration) -> Iterator[Fault]:
     rule = f"its photographs must show the face within {MAX_OFFSET_MM:g} mm of the scan"
-    cure = "correct K, R and t, the order of the frames, or the pose of the scan"
     for c, camera in enumerate(dome.cameras):
         offset = calibration.camera_offset[c]
         agreement = calibration.camera_agreement[c]
@@ -364,19 +367,24 @@ def _camera_faults(dome: DomeRecord, calibration: Calibration) -> Iterator[Fault
             finding = f"the face {_beside(offset, scale)}, correlation {agreement:.2f}"
             finding = calibration.explanations.get(c, finding)
             yield Fault(
-                f"{dome.file}[cameras], camera {camera.id}", rule, finding, cure
+                f"{dome.file}[cameras], camera {camera.id}",
+                rule,
+                finding,
+                "correct K, R and t, the order of the frames, or the pose of the scan",
             )
 
 
 def _light_faults(dome: DomeRecord, calibration: Calibration) -> Iterator[Fault]:
-    rule = "the shading of the face must match its position"
-    cure = "correct its position, or the order of the frames"
     shading = calibration.light_agreement
     better = calibration.light_similar_agreement - shading
     for j, light in enumerate(dome.lights):
         if better[j] > MAX_BETTER_LIGHT or shading[j] < MIN_LIGHT_AGREEMENT:
-            place = f"{dome.file}[lights], light {light.id}"
-            yield Fault(place, rule, _shading(dome, calibration, j), cure)
+            yield Fault(
+                f"{dome.file}[lights], light {light.id}",
+                "the shading of the face must match its position",
+                _shading(dome, calibration, j),
+                "correct its position, or the order of the frames",
+            )
 
 
 def _shading(dome: DomeRecord, calibration: Calibration, j: int) -> str:

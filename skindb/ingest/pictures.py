@@ -315,14 +315,19 @@ class _Frames:
             camera.setdefault("width", width),
             camera.setdefault("height", height),
         )
-        found = f"{width} x {height} of {picture.dtype}"
         exact = picture.dtype == self.dtype or (
             self.linear and picture.dtype.kind == "f"
         )
         if wanted != (width, height) or not exact:
             rule = "all pictures must be {} x {} of {}".format(*wanted, self.dtype)
-            cure = "export it like the others"
-            self.faults.append(Fault(str(file), rule, found, cure))
+            self.faults.append(
+                Fault(
+                    str(file),
+                    rule,
+                    f"{width} x {height} of {picture.dtype}",
+                    "export it like the others",
+                )
+            )
             return
         if inside is not None:
             picture[~inside] = 0
@@ -431,14 +436,20 @@ def read_lights(path: Path) -> list[Light]:
             found.append(light)
     names = [light.name for light in found]
     for name in sorted({name for name in names if names.count(name) > 1}):
-        rule = "a picture must have one light"
-        cure = "remove the lines that do not apply"
-        faults.append(Fault(str(path), rule, f"{short(name)} twice", cure))
+        faults.append(
+            Fault(
+                str(path),
+                "a picture must have one light",
+                f"{short(name)} twice",
+                "remove the lines that do not apply",
+            )
+        )
     if faults:
         raise InputError(faults)
     if not 1 <= len(found) <= MAX_LIGHTS:
-        finding = f"{len(found)} lights"
-        raise _table_fault(path, f"must have 1 to {MAX_LIGHTS:,} lights", finding)
+        raise _table_fault(
+            path, f"must have 1 to {MAX_LIGHTS:,} lights", f"{len(found)} lights"
+        )
     return found
 
 
@@ -473,9 +484,12 @@ def read_picture(path: Path) -> Picture:
         if picture.dtype not in (np.uint8, np.uint16):
             raise ValueError(f"values of {picture.dtype}, not of 8 or 16 bits")
     except (ValueError, RuntimeError, OSError, Image.DecompressionBombError) as error:
-        rule = f"a picture must be a whole {FORMATS} file"
-        cure = "export it as PNG, JPEG or plain TIFF; raw and HEIC files have to be converted"
-        raise input_error(str(path), rule, short(str(error)), cure) from None
+        raise input_error(
+            str(path),
+            f"a picture must be a whole {FORMATS} file",
+            short(str(error)),
+            "export it as PNG, JPEG or plain TIFF; raw and HEIC files have to be converted",
+        ) from None
     if picture.shape[2] < 3:
         picture = np.repeat(picture[..., :1], 3, axis=2)
     return np.array(picture[..., :3])
@@ -846,9 +860,12 @@ def _colmap_cameras(folder: Path) -> list[dict[str, Any]]:
     except InputError:
         raise
     except (ValueError, KeyError) as error:
-        rule = "must be a text model of COLMAP, with one image for each camera"
-        cure = "export the model as text again"
-        raise input_error(place, rule, short(str(error)), cure) from None
+        raise input_error(
+            place,
+            "must be a text model of COLMAP, with one image for each camera",
+            short(str(error)),
+            "export the model as text again",
+        ) from None
     return found
 
 

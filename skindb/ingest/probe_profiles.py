@@ -398,18 +398,21 @@ def _light_faults(
     faults = list[Fault]()
     minimum = min(MIN_LIT_FIBRES, len(probe.fibres))
     rule = f"at least {minimum} fibres must show light, and not be saturated in every bracket"
-    cure = "place the probe and take its frames again, or remove the site"
     for site, (values, errors) in zip(probe.sites, signals, strict=True):
         names = probe.placements[site]
         for placement, value, error in zip(names, values, errors, strict=True):
             lit = int((value > MIN_SIGNAL_TO_NOISE * error).any(axis=1).sum())
             if lit < minimum:
                 saturated = int(np.isnan(value).all(axis=1).sum())
-                finding = (
-                    f"{place_text(site, placement)}: {lit} of {len(value)}, "
-                    f"{saturated} saturated"
+                faults.append(
+                    Fault(
+                        f"{probe.file}[frames]",
+                        rule,
+                        f"{place_text(site, placement)}: {lit} of {len(value)}, "
+                        f"{saturated} saturated",
+                        "place the probe and take its frames again, or remove the site",
+                    )
                 )
-                faults.append(Fault(f"{probe.file}[frames]", rule, finding, cure))
     return faults
 
 
@@ -422,17 +425,15 @@ def _require_energy(probe: ProbeRecord, value: Float64, error: Float64) -> None:
     if not (returned > MAX_RETURNED_FRACTION).any():
         return
     site, fibre, _ = np.unravel_index(int(np.nanargmax(returned)), returned.shape)
-    rule = (
-        f"R at r mm must be at most {MAX_RETURNED_FRACTION:g} / (pi r^2): skin cannot "
-        "return more light"
+    raise InputError(
+        Fault(
+            f"{probe.file}[scale]",
+            f"R at r mm must be at most {MAX_RETURNED_FRACTION:g} / (pi r^2): skin cannot "
+            "return more light",
+            f"{np.nanmax(returned):.3g} / (pi r^2) at fibre {fibre} of {probe.sites[site]}",
+            "correct scale, gain, seconds or distance; use a scale of null if it is unknown",
+        )
     )
-    finding = (
-        f"{np.nanmax(returned):.3g} / (pi r^2) at fibre {fibre} of {probe.sites[site]}"
-    )
-    cure = (
-        "correct scale, gain, seconds or distance; use a scale of null if it is unknown"
-    )
-    raise InputError(Fault(f"{probe.file}[scale]", rule, finding, cure))
 
 
 def combine_placements(

@@ -335,10 +335,13 @@ def _locked(folder: Path, *, new: bool = True) -> int:
             pass
         except BlockingIOError:
             os.close(lock)
-            rule = "one process ingests a capture"
-            cure = "wait until the other one has ended"
             raise InputError(
-                Fault(str(folder), rule, "another one does", cure)
+                Fault(
+                    str(folder),
+                    "one process ingests a capture",
+                    "another one does",
+                    "wait until the other one has ended",
+                )
             ) from None
         except OSError:
             os.close(lock)

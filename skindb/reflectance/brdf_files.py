@@ -97,14 +97,12 @@ def read_tables(path: str | Path) -> Dictionary:
     table = np.stack([table for table, _ in resampled], axis=-1)
     albedo = directional_albedo(table, 1.0)[0]
     if albedo.max() > 2:  # more than an error of measurement explains
-        rule = "a surface must not reflect more light than it receives"
-        cure = "provide values in sr^-1"
         raise InputError(
             Fault(
                 f"{path}[{TABLE}]",
-                rule,
+                "a surface must not reflect more light than it receives",
                 f"an albedo of {albedo.max():.3g} at normal incidence",
-                cure,
+                "provide values in sr^-1",
             )
         )
     names = (
@@ -151,17 +149,25 @@ def _load(path: Path) -> dict[str, AnyArray]:
             )
         ) from None
     except (ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile):
-        cure = "write it with skindb.reflectance.brdf_files.write_tables or numpy.savez"
         raise InputError(
             Fault(
-                str(path), "must be an .npz file of plain arrays", "another file", cure
+                str(path),
+                "must be an .npz file of plain arrays",
+                "another file",
+                "write it with skindb.reflectance.brdf_files.write_tables or numpy.savez",
             )
         ) from None
     missing = [name for name in (TABLE, *NODES) if name not in arrays]
     if missing:
         rule = f"must contain {TABLE} and its nodes {', '.join(NODES)}"
-        fault = f"no {', '.join(missing)}"
-        raise InputError(Fault(str(path), rule, fault, "add them, in sr^-1 and rad"))
+        raise InputError(
+            Fault(
+                str(path),
+                rule,
+                f"no {', '.join(missing)}",
+                "add them, in sr^-1 and rad",
+            )
+        )
     wrong = [name for name in (TABLE, *NODES) if arrays[name].dtype.kind not in "fiu"]
     if wrong:
         raise InputError(
@@ -190,18 +196,21 @@ def _node_faults(path: Path, arrays: Mapping[str, AnyArray]) -> list[Fault]:
         nodes = arrays[name]
         place = f"{path}[{name}]"
         if nodes.ndim != 1 or len(nodes) < minimum:
-            rule = f"must be a one-dimensional array of at least {minimum} nodes"
             faults.append(
-                Fault(place, rule, f"the shape {nodes.shape}", "add the nodes")
+                Fault(
+                    place,
+                    f"must be a one-dimensional array of at least {minimum} nodes",
+                    f"the shape {nodes.shape}",
+                    "add the nodes",
+                )
             )
         elif not (np.diff(nodes) > 0).all():
-            cure = "sort nodes and table, and remove repeated nodes"
             faults.append(
                 Fault(
                     place,
                     "nodes must be in strictly ascending order",
                     "another order",
-                    cure,
+                    "sort nodes and table, and remove repeated nodes",
                 )
             )
         else:
@@ -218,24 +227,26 @@ def _shape_faults(path: Path, arrays: Mapping[str, AnyArray]) -> list[Fault]:
         or brdf.shape[4:] not in ((), (3,))
         or not len(brdf)
     ):
-        rule = (
-            f"must have the shape (materials, {', '.join(map(str, lengths))}), or with "
-            "RGB (..., 3)"
-        )
-        cure = "transpose it, or correct the nodes"
-        return [Fault(f"{path}[{TABLE}]", rule, str(brdf.shape), cure)]
+        return [
+            Fault(
+                f"{path}[{TABLE}]",
+                f"must have the shape (materials, {', '.join(map(str, lengths))}), or with "
+                "RGB (..., 3)",
+                str(brdf.shape),
+                "transpose it, or correct the nodes",
+            )
+        ]
     names = (
         [str(name) for name in np.atleast_1d(arrays["names"])]
         if "names" in arrays
         else []
     )
     if "names" in arrays and (len(names) != len(brdf) or len(set(names)) != len(brdf)):
-        counts = f"{len(names)} names, {len(set(names))} of them different"
         return [
             Fault(
                 f"{path}[names]",
                 f"{len(brdf)} materials must have as many different names",
-                counts,
+                f"{len(names)} names, {len(set(names))} of them different",
             )
         ]
     return []
@@ -259,12 +270,14 @@ def _range_faults(name: str, nodes: Array, place: str) -> list[Fault]:
     if name == "phi_d":
         gap = float(np.diff(nodes, append=nodes[0] + np.pi).max())
         if low < 0 or high > np.pi - 1e-9:
-            cure = (
-                "average both halves, as a reciprocal isotropic BRDF has period pi, "
-                "and omit the end"
-            )
             return [
-                Fault(place, "nodes must lie in [0, pi)", f"[{low:g}, {high:g}]", cure)
+                Fault(
+                    place,
+                    "nodes must lie in [0, pi)",
+                    f"[{low:g}, {high:g}]",
+                    "average both halves, as a reciprocal isotropic BRDF has period pi, "
+                    "and omit the end",
+                )
             ]
         if gap > np.pi / 2 + 1e-9 and len(nodes) > 1:
             rule = (
@@ -299,9 +312,14 @@ def _unit_faults(path: Path, arrays: Mapping[str, AnyArray]) -> list[Fault]:
         )
     disc = arrays.get("disc_angular_radius", np.zeros(()))
     if disc.shape != () or disc.dtype.kind not in "fiu" or not 0 <= disc < 0.5:
-        rule = "must be one angle from 0 to 0.5 rad"
-        cure = "omit it for tables of point lights"
-        faults.append(Fault(f"{path}[disc_angular_radius]", rule, str(disc), cure))
+        faults.append(
+            Fault(
+                f"{path}[disc_angular_radius]",
+                "must be one angle from 0 to 0.5 rad",
+                str(disc),
+                "omit it for tables of point lights",
+            )
+        )
     return faults
 
 
@@ -331,13 +349,13 @@ def _value_faults(path: Path, arrays: Mapping[str, AnyArray]) -> list[Fault]:
         ]
     )
     if (holes > MAX_HOLE_FRACTION).any():
-        rule = (
-            f"at most {MAX_HOLE_FRACTION:.0%} of the nodes above the horizon may be NaN"
-        )
         counts = f"{holes.max():.0%} in material {int(holes.argmax())}"
         faults.append(
             Fault(
-                place, rule, counts, "measure more directions, or remove the material"
+                place,
+                f"at most {MAX_HOLE_FRACTION:.0%} of the nodes above the horizon may be NaN",
+                counts,
+                "measure more directions, or remove the material",
             )
         )
     return faults
@@ -423,9 +441,14 @@ def read_merl_folder(path: str | Path) -> Dictionary:
     """
     files = sorted(Path(path).glob("*.binary"))
     if not files:
-        rule = "the folder must contain MERL .binary files"
-        cure = "choose their folder, or an .npz file of tables"
-        raise InputError(Fault(str(path), rule, "none", cure))
+        raise InputError(
+            Fault(
+                str(path),
+                "the folder must contain MERL .binary files",
+                "none",
+                "choose their folder, or an .npz file of tables",
+            )
+        )
     # centres of bins; theta_h is quadratic
     h, d, p = ((np.arange(n) + 0.5) / n for n in SHAPE)
     nodes = (h**2 * np.pi / 2, d * np.pi / 2, p * np.pi)

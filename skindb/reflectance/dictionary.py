@@ -325,17 +325,13 @@ def convolve_disc(
     before = dictionary.disc_angular_radius
     # the fit rounds to a hundredth of a degree
     if before and abs(before - angular_radius) > np.radians(0.0101):
-        rule = (
-            "tables must be for point lights or for the disc of these lights, "
-            f"{np.degrees(angular_radius):.2f} degrees"
-        )
-        cure = "provide tables for point lights"
         raise InputError(
             Fault(
                 dictionary.source,
-                rule,
+                "tables must be for point lights or for the disc of these lights, "
+                f"{np.degrees(angular_radius):.2f} degrees",
                 f"a disc of {np.degrees(before):.2f} degrees",
-                cure,
+                "provide tables for point lights",
             )
         )
     if before or angular_radius <= 0:

@@ -94,9 +94,14 @@ class GGX:
     def unfitted(cls, request: FitRequest) -> GGX:
         """The model before a fit; there is none of a dictionary."""
         if request.dictionary is not None:
-            rule = "mixtures alone are of a dictionary"
-            cure = "omit it, or fit a mixture"
-            raise InputError(Fault("dictionary", rule, "ggx", cure))
+            raise InputError(
+                Fault(
+                    "dictionary",
+                    "mixtures alone are of a dictionary",
+                    "ggx",
+                    "omit it, or fit a mixture",
+                )
+            )
         return cls(request.eta, request.disc_angular_radius)
 
     @classmethod

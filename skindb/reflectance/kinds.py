@@ -82,6 +82,11 @@ def as_mixture(model: xr.DataTree) -> xr.DataTree:
 def require_mixture(names: Container[object], place: str) -> None:
     """Raise `InputError` unless `names` has the weights of a dictionary."""
     if "dictionary_weight" not in names and "dictionary" not in names:
-        rule = "edits and studies of BRDFs need mixtures of measured BRDFs"
-        cure = "fit with --surface mixture"
-        raise InputError(Fault(place, rule, "another surface model", cure))
+        raise InputError(
+            Fault(
+                place,
+                "edits and studies of BRDFs need mixtures of measured BRDFs",
+                "another surface model",
+                "fit with --surface mixture",
+            )
+        )

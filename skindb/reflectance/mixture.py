@@ -123,8 +123,14 @@ class Mixture:
         tables = disc_dictionary(request.dictionary, request.disc_angular_radius)
         count = len(tables.names)
         if request.k > count:  # checked before the fit
-            rule = f"a reduced basis of this dictionary has 1 to {count} components"
-            raise InputError(Fault("k", rule, str(request.k), "choose a smaller k"))
+            raise InputError(
+                Fault(
+                    "k",
+                    f"a reduced basis of this dictionary has 1 to {count} components",
+                    str(request.k),
+                    "choose a smaller k",
+                )
+            )
         return cls.of_dictionary(tables, rank=request.rank)
 
     @classmethod
@@ -322,9 +328,11 @@ class Mixture:
             return self, parameters, ()
         names = tuple(np.array(self.names)[positive])
         tables = np.ascontiguousarray(self.table[..., positive])
-        reason = "their weight is zero everywhere"
         omission = Omission(
-            "basis BRDFs", int((~positive).sum()), positive.size, reason
+            "basis BRDFs",
+            int((~positive).sum()),
+            positive.size,
+            "their weight is zero everywhere",
         )
         fewer = replace(self, table=tables, names=names)
         return fewer, parameters[:, positive], (omission,)

@@ -367,13 +367,12 @@ def fitted_surfels(fitted: xr.Dataset, names: Sequence[str]) -> Index:
             f"{n} {FitStatus(s).name.lower()}"
             for s, n in zip(status, count, strict=True)
         )
-        cure = "add lights and cameras, or hold fewer out"
         raise InputError(
             Fault(
                 "fitted[fit_status]",
                 "a basis needs fitted surfels",
                 counts_by_status,
-                cure,
+                "add lights and cameras, or hold fewer out",
             )
         )
     return np.flatnonzero(good)

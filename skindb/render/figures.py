@@ -363,9 +363,15 @@ def _chosen(
         values = values.isel({dim: labels.index(at.pop(dim))})
     if at:
         dims = ", ".join(map(str, values.dims))
-        rule = f"must name dimensions of {values.name}, which has {dims}"
         cure = "remove the others"
-        raise InputError(Fault("at", rule, ", ".join(at), cure))
+        raise InputError(
+            Fault(
+                "at",
+                f"must name dimensions of {values.name}, which has {dims}",
+                ", ".join(at),
+                cure,
+            )
+        )
     return values
 
 

@@ -137,9 +137,13 @@ def read_exr(path: str | Path) -> tuple[Image, tuple[str, ...]]:
                 for name, plane in file.channels().items()
             }
     except (RuntimeError, ValueError, UserWarning):
-        cure = "convert other formats to OpenEXR; write a damaged file again"
         raise InputError(
-            Fault(str(path), "must be a complete OpenEXR image", DAMAGED, cure)
+            Fault(
+                str(path),
+                "must be a complete OpenEXR image",
+                DAMAGED,
+                "convert other formats to OpenEXR; write a damaged file again",
+            )
         ) from None
     colour = [name for name in "RGBA" if name in planes]
     names = (*colour, *sorted(set(planes) - set(colour)))

@@ -369,9 +369,14 @@ def compare_photographs(
         taken = _Taken(photo, diffuse, gloss, mask)
         results.append(taken.compared(light, name, is_unseen, view, regions, doubtful))
     if not results:
-        rule = "at least one must show the face"
-        cure = "ingest the capture again with more --photographs"
-        raise InputError(Fault("photographs", rule, "none", cure))
+        raise InputError(
+            Fault(
+                "photographs",
+                "at least one must show the face",
+                "none",
+                "ingest the capture again with more --photographs",
+            )
+        )
     return results
 
 
@@ -384,9 +389,14 @@ def _kept_photographs(capture: xr.DataTree) -> list[xr.Dataset]:
         If ingest kept none.
     """
     if "photographs" not in capture.children:
-        rule = "must contain kept photographs"
-        cure = "ingest the capture again with --photographs 4"
-        raise InputError(Fault("capture", rule, "none", cure))
+        raise InputError(
+            Fault(
+                "capture",
+                "must contain kept photographs",
+                "none",
+                "ingest the capture again with --photographs 4",
+            )
+        )
     photographs = capture["photographs"].to_dataset()
     needed = (
         variables.PHOTOGRAPH_RADIANCE,

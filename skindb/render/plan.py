@@ -251,13 +251,12 @@ def notable_lights(
         return lights, ()
     bright = np.ones(len(lights), bool)
     bright[dropped] = False
-    reason = f"together they contribute less than {ERROR_PART:g} of the wanted error"
     return lights.select(bright), (
         Omission(
             "lights",
             len(dropped),
             len(lights),
-            reason,
+            f"together they contribute less than {ERROR_PART:g} of the wanted error",
             bound,
             "pictures (root mean square)",
         ),

@@ -170,13 +170,12 @@ def frontal_camera(dome: xr.Dataset) -> int:
 
 def _index(names: list[str], name: str, device: str) -> int:
     if name not in names:
-        cure = f"choose {', '.join(names)}"
         raise InputError(
             Fault(
                 f"{device} {name}",
                 f"must be a {device} of the dome",
                 "no such name",
-                cure,
+                f"choose {', '.join(names)}",
             )
         )
     return names.index(name)
@@ -419,9 +418,13 @@ def render_picture(
         If an option is out of its limits, and as `render`.
     """
     if out.suffix not in (".exr", ".png"):
-        rule = "the name of a picture must end in .exr or .png"
         raise InputError(
-            Fault(str(out), rule, out.suffix or "no suffix", "change the name")
+            Fault(
+                str(out),
+                "the name of a picture must end in .exr or .png",
+                out.suffix or "no suffix",
+                "change the name",
+            )
         )
     settings = dict(vars(RenderParameters(**options)))
     exposure = settings.pop("exposure")

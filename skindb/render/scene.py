@@ -107,9 +107,13 @@ class Camera:
         width = round(self.width * factor)
         height = round(self.height * factor)
         if not 1 <= width * height <= MAX_PICTURE_PIXELS:
-            rule = f"a picture must have 1 to {MAX_PICTURE_PIXELS:,} pixels"
             raise InputError(
-                Fault("scale", rule, f"{width} x {height}", "choose a smaller scale")
+                Fault(
+                    "scale",
+                    f"a picture must have 1 to {MAX_PICTURE_PIXELS:,} pixels",
+                    f"{width} x {height}",
+                    "choose a smaller scale",
+                )
             )
         K = np.diag([factor, factor, 1.0]) @ self.K
         return replace(self, K=K, width=width, height=height)
@@ -203,9 +207,13 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
     position = values.pop(variables.SURFEL_POSITION)
     usable = usable_surfels(values)
     if not usable.any():
-        rule = "at least one surfel must be fitted for a picture"
         raise InputError(
-            Fault("fitted[fit_status]", rule, "none", "see the report of the fit")
+            Fault(
+                "fitted[fit_status]",
+                "at least one surfel must be fitted for a picture",
+                "none",
+                "see the report of the fit",
+            )
         )
     del values[variables.FIT_STATUS]
     if fill:
@@ -300,19 +308,13 @@ def subdivide_surface(surface: Surface, spacing: float, visible: Mask) -> Surfac
         if not len(chosen):
             break
         if len(vertices) + 3 * len(chosen) > MAX_VERTICES:
-            rule = (
-                "the part of the face in the picture must have at most "
-                f"{MAX_VERTICES:,} vertices"
-            )
-            size = (
-                f"{len(vertices):,} and {len(chosen):,} triangles that are still "
-                f"coarser than {spacing:g} mm"
-            )
             raise InputError(
                 Fault(
                     "spacing",
-                    rule,
-                    size,
+                    "the part of the face in the picture must have at most "
+                    f"{MAX_VERTICES:,} vertices",
+                    f"{len(vertices):,} and {len(chosen):,} triangles that are still "
+                    f"coarser than {spacing:g} mm",
                     "choose a larger spacing, or a closer picture",
                 )
             )

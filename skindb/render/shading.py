@@ -39,13 +39,11 @@ def require_translucency(surface: Surface) -> None:
     if missing := [
         channel for c, channel in enumerate("RGB") if not finite[:, c].any()
     ]:
-        rule = "must have sigma_tr in R, G and B for subsurface transport"
-        missing_text = f"no probe site with a valid fit in {', '.join(missing)}"
         raise InputError(
             Fault(
                 "model",
-                rule,
-                missing_text,
+                "must have sigma_tr in R, G and B for subsurface transport",
+                f"no probe site with a valid fit in {', '.join(missing)}",
                 "omit --subsurface, or repeat the probe measurement",
             )
         )

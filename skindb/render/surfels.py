@@ -81,9 +81,13 @@ def surfel_confidence(fitted: xr.Dataset) -> Float32:
     """(n,) 1 for fitted surfels, 0.5 for doubtful fits, 0 for all others."""
     trust: Float32 = TRUST[surfel_texels(fitted)]
     if not trust.any():
-        rule = "at least one surfel must be fitted for an export"
         raise InputError(
-            Fault("fitted[fit_status]", rule, "none", "see the report of the fit")
+            Fault(
+                "fitted[fit_status]",
+                "at least one surfel must be fitted for an export",
+                "none",
+                "see the report of the fit",
+            )
         )
     return trust
 
@@ -305,9 +309,13 @@ def _values_of(
     """
     count = fitted.sizes["surfel"]
     if not 0 <= surfel < count:
-        rule = f"surfel must be an index from 0 to {count - 1}"
         raise InputError(
-            Fault("surfel", rule, str(surfel), "choose a surfel of this model")
+            Fault(
+                "surfel",
+                f"surfel must be an index from 0 to {count - 1}",
+                str(surfel),
+                "choose a surfel of this model",
+            )
         )
     names = [*NEEDED, *reflectance.parameter_variables]
     names += [variables.EVEN_REFLECTION] * (variables.EVEN_REFLECTION in fitted)
@@ -317,14 +325,12 @@ def _values_of(
     values["parameters"] = reflectance.parameters_of(row)
     if not usable_surfels(values)[0]:
         status = FitStatus(int(values[variables.FIT_STATUS][0]))
-        reason = f"the status {status.name} ({status.explanation})"
-        cure = "choose a surfel whose fit_status is FITTED"
         raise InputError(
             Fault(
                 f"fitted[fit_status] of surfel {surfel}",
                 "the surfel must be fitted",
-                reason,
-                cure,
+                f"the status {status.name} ({status.explanation})",
+                "choose a surfel whose fit_status is FITTED",
             )
         )
     return values
@@ -334,12 +340,11 @@ def _unit(name: str, direction: ArrayLike) -> Array:
     """Directions (..., 3) in double precision, checked to be unit vectors and then normalised."""
     vectors = np.asarray(direction, np.float64)
     if vectors.ndim == 0 or vectors.shape[-1] != 3:
-        shape = f"the shape {vectors.shape}"
         raise InputError(
             Fault(
                 name,
                 "directions must have the shape (..., 3)",
-                shape,
+                f"the shape {vectors.shape}",
                 "put x, y, z last",
             )
         )

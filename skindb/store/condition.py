@@ -138,11 +138,12 @@ class _Evaluation:
                 contained = self.contained(node.left, right)
                 return contained if isinstance(op, ast.In) else _negated(contained)
         if not {*map(type, node.ops)} <= {*COMPARISONS}:
-            rule = (
+            raise self.fault(
                 "must use 'is' as in 'age is missing', and 'in' without other "
-                "comparisons beside it"
+                "comparisons beside it",
+                "another use",
+                EXAMPLE,
             )
-            raise self.fault(rule, "another use", EXAMPLE)
         sides = [self.values(side) for side in (node.left, *node.comparators)]
         links = [
             self.compared(op, *pair)

@@ -91,15 +91,12 @@ def require_own_subject(kind: str, take: str, names: Iterable[str]) -> None:
     """
     foreign = sorted(name for name in names if subject_of(name) != subject_of(take))
     if kind in KINDS_OF_ONE_SUBJECT and foreign:
-        cure = (
-            "commit what many subjects share as a kind of its own, and name that "
-            "version as the input"
-        )
         raise input_error(
             f"{kind} of {take}",
             f"a {kind} must refer to takes of its own subject only",
             f"a reference to {', '.join(foreign)}",
-            cure,
+            "commit what many subjects share as a kind of its own, and name that "
+            "version as the input",
         )
 
 

@@ -374,11 +374,13 @@ def _lease_name(key: str) -> str:
 
 
 def _held_fault(claim: Claim) -> Fault:
-    cure = (
+    return Fault(
+        _lease_name(claim.key),
+        ONE_RUN,
+        str(claim),
         "wait for it (--wait SECONDS) or end it; its lease expires "
-        f"{claim.seconds:.0f} s after its last renewal"
+        f"{claim.seconds:.0f} s after its last renewal",
     )
-    return Fault(_lease_name(claim.key), ONE_RUN, str(claim), cure)
 
 
 def _lost_fault(key: str, newest: Claim | None) -> Fault:

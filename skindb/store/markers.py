@@ -274,8 +274,6 @@ def readmit(place: Place, subject: str, consent: date) -> None:
         in the future.
     """
     entry = last_entry(place, subject)
-    rule = "a new consent must be given after the withdrawal of the subject, and not in the future"
-    cure = "state the date on which the subject signed it"
     if entry is None:
         raise input_error(
             subject,
@@ -295,9 +293,9 @@ def readmit(place: Place, subject: str, consent: date) -> None:
     require(
         entry.date <= consent <= date.today(),
         subject,
-        rule,
+        "a new consent must be given after the withdrawal of the subject, and not in the future",
         f"{consent}, and a withdrawal on {entry.date}",
-        cure,
+        "state the date on which the subject signed it",
     )
     if not _create_entry(
         place, subject, entry.number + 1, {"readmitted": consent.isoformat()}

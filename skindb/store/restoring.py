@@ -113,13 +113,10 @@ def restore(
     place = place_at(url)
     file = markers or place.marker_file()
     if not without_markers and not file.exists():
-        rule = (
-            "a restore needs the marker file, because subjects who were withdrawn "
-            "after the backup would come back"
-        )
         raise input_error(
             str(file),
-            rule,
+            "a restore needs the marker file, because subjects who were withdrawn "
+            "after the backup would come back",
             "no such file",
             "give --markers FILE, or --without-markers to accept this risk",
         )

@@ -76,11 +76,13 @@ def bucket_and_prefix(url: str) -> tuple[str, str]:
         re.fullmatch(PREFIX_PART, part) and part not in (".", "..") for part in parts
     )
     if not (usable and re.fullmatch(BUCKET, bucket)):
-        rule = (
+        raise input_error(
+            url,
             "must be s3://BUCKET/PREFIX of lower-case letters, digits, '.', '-'; "
-            "PREFIX also of capitals, '_', '='"
+            "PREFIX also of capitals, '_', '='",
+            "a different form",
+            "choose another name",
         )
-        raise input_error(url, rule, "a different form", "choose another name")
     return bucket, prefix
 
 

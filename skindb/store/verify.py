@@ -195,17 +195,20 @@ def _unrecorded_faults(
     named = {
         record.beside(suffix) for record in records for suffix in ("manifest", TABLES)
     }
-    rule = "a record of the log must name every version that was written completely"
-    cure = (
-        "restore its record from a backup; if its run was killed, remove this file and "
-        "the version beside it"
-    )
     faults = []
     for key in beside:
         _, kind, take, _ = key.split("/")
         is_known = key in named or kind in TRANSIENT or f"{kind} of {take}" in damaged
         if not is_known and _has_lost_record(place, kind, take):
-            faults.append(Fault(place.where(key), rule, "no such record", cure))
+            faults.append(
+                Fault(
+                    place.where(key),
+                    "a record of the log must name every version that was written completely",
+                    "no such record",
+                    "restore its record from a backup; if its run was killed, remove this file and "
+                    "the version beside it",
+                )
+            )
     return faults
 
 

@@ -289,15 +289,14 @@ def laboratory_faults(
                 raise ValueError(name)
         except ValueError:
             names = ", ".join(f"dome.{n}" for n in kinds)
-            rule = (
+            raise input_error(
+                "--fault",
                 "must be dropped_frame=CAMERA:NUMBER, hot_pixels=N, lamp=FRACTION, "
-                f"{names}, or the same with probe"
-            )
-            cure = (
+                f"{names}, or the same with probe",
+                repr(text),
                 "numbers are not negative, probabilities at most 1, lights and cameras "
-                "those of the set-up"
-            )
-            raise input_error("--fault", rule, repr(text), cure) from None
+                "those of the set-up",
+            ) from None
     if not texts:
         return None
     dome = DeviceFaults(**devices["dome"])

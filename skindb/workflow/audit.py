@@ -244,9 +244,11 @@ def _checked_actor(source: str, actor: str) -> str:
         and 0 < len(actor) <= MAX_ACTOR_CHARACTERS
     )
     if not is_valid:
-        rule = (
+        raise input_error(
+            source,
             f"must be 1 to {MAX_ACTOR_CHARACTERS} characters that can be printed, "
-            "without spaces around them"
+            "without spaces around them",
+            repr(actor)[:200],
+            "choose another name",
         )
-        raise input_error(source, rule, repr(actor)[:200], "choose another name")
     return actor

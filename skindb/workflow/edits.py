@@ -333,10 +333,13 @@ def _trait_study(db: Database, name: str | None) -> str:
     is_only = len(stored) == 1 and "traits" not in stored
     study = name or (stored[0] if is_only else "traits")
     if study not in stored:
-        rule = "must be a study of traits in the database"
-        finding = f"studies of traits: {', '.join(stored) or 'none'}"
         cure = "run: skindb analyze DB traits"
         if stored:
             cure = "name one of them with --study"
-        raise input_error(f"study {study}", rule, finding, cure)
+        raise input_error(
+            f"study {study}",
+            "must be a study of traits in the database",
+            f"studies of traits: {', '.join(stored) or 'none'}",
+            cure,
+        )
     return study

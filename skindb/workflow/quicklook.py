@@ -71,9 +71,13 @@ def quick(
     out = Path(out)
     names = [PAGE, *(f"{name}.{kind}" for name in MAPS for kind in ("png", "exr"))]
     present = [name for name in names if (out / name).exists()]
-    rule = "results are not replaced"
-    cure = "name another folder, or remove them"
-    require(not present, str(out), rule, ", ".join(present), cure)
+    require(
+        not present,
+        str(out),
+        "results are not replaced",
+        ", ".join(present),
+        "name another folder, or remove them",
+    )
     known = asdict(QuickParameters(**parameters))
     fit = FitParameters(eta=known.pop("eta"))
     consent = {"scope": ["fit", "export"], "reference": "quick, nothing is stored"}

@@ -432,14 +432,11 @@ def _laboratory(
     subject = parameters.setup or _virtual_subject(beside, parameters.seed, progress)
     dome = read_capture(subject).dome
     if dome is None or not dome.frames.endswith(".png"):
-        rule = (
-            "with --virtual it must be a capture with PNG frames, which the emulated "
-            "cameras deliver"
-        )
         frames = "no dome" if dome is None else dome.frames
         raise input_error(
             "--setup",
-            rule,
+            "with --virtual it must be a capture with PNG frames, which the emulated "
+            "cameras deliver",
             f"{frames} in {subject}",
             "name another capture; skindb simulate writes some",
         )

@@ -126,8 +126,9 @@ def _stored_options(note: Path) -> dict[str, Any]:
     try:
         stored = json.loads(read_regular(note, MOST_BYTES))
     except (ValueError, RecursionError) as error:
-        cure = "choose another folder"
-        fault = Fault(str(note), "must be a JSON object", str(error), cure)
+        fault = Fault(
+            str(note), "must be a JSON object", str(error), "choose another folder"
+        )
         raise InputError(fault) from None
     return stored if isinstance(stored, dict) else {}
 

@@ -69,16 +69,13 @@ class KilledError(InputError):
     """The process of a take was killed, perhaps by a take beside it."""
 
     def __init__(self, take: Any) -> None:
-        cure = (
-            "a lack of memory is the usual reason: close other programs, or use fewer "
-            "workers"
-        )
         super().__init__(
             Fault(
                 str(take),
                 "the process of a take must run to its end",
                 "it was killed",
-                cure,
+                "a lack of memory is the usual reason: close other programs, or use fewer "
+                "workers",
             )
         )
 
@@ -222,10 +219,12 @@ def _attempt(function: Callable[[Take], Result], take: Take) -> Outcome[Take, Re
 
 def defective(take: Take, error: BaseException, text: str = "") -> Outcome[Take, Any]:
     """Outcome of a take that shows a defect of the program, with its traceback."""
-    rule = "a take must not end in an internal error"
-    finding = f"{type(error).__name__}: {error}"
-    cure = "this is a defect of skindb: report it with the traceback that -v shows"
-    fault = Fault(str(take), rule, finding, cure)
+    fault = Fault(
+        str(take),
+        "a take must not end in an internal error",
+        f"{type(error).__name__}: {error}",
+        "this is a defect of skindb: report it with the traceback that -v shows",
+    )
     return Outcome(take, error=InputError(fault), traceback=text)
 
 
@@ -282,12 +281,11 @@ class Expected:
     def require(self, worker: str) -> None:
         """Raise an `InputError` if this process, which is the named worker, has something else."""
         if (self.version, self.code) != (__version__, package_digest()):
-            rule = f"must run the same skindb as this process ({self.version})"
             finding = f"version {__version__}"
             finding += "" if __version__ != self.version else " with other source code"
             raise input_error(
                 f"worker {worker}",
-                rule,
+                f"must run the same skindb as this process ({self.version})",
                 finding,
                 "install the same version, restart the worker",
             )
