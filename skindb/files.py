@@ -19,7 +19,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-from skindb.errors import Fault, InputError, input_error
+from skindb.errors import InputError, input_error
 
 ROOT = Path(__file__).parent
 PRIVATE = 0o700  # permissions of folders with personal data
@@ -103,22 +103,20 @@ def _not_opened(path: Path, error: OSError) -> InputError:
     except (OSError, ValueError):
         if isinstance(error, FileNotFoundError):
             found = "no such file"
-        return InputError(Fault(where, "the file must exist", found, CURE_MISSING))
+        return input_error(where, "the file must exist", found, CURE_MISSING)
     if not stat.S_ISREG(mode):
         return _of_kind(where, mode)
-    return InputError(
-        Fault(
-            where,
-            "the file must be readable",
-            found,
-            "check its permissions and the disk",
-        )
+    return input_error(
+        where,
+        "the file must be readable",
+        found,
+        "check its permissions and the disk",
     )
 
 
 def _of_kind(where: str, mode: int) -> InputError:
     found = next((name for test, name in KINDS if test(mode)), "something else")
-    return InputError(Fault(where, "must be a regular file", found, CURE_KIND))
+    return input_error(where, "must be a regular file", found, CURE_KIND)
 
 
 def _size(count: int) -> str:

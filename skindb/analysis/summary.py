@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from skindb.analysis.regions import own_masks
-from skindb.errors import Fault, InputError, require
+from skindb.errors import InputError, input_error, require
 from skindb.geometry.atlas import atlas_values, push_pull, rasterise_atlas
 from skindb.render.surfels import surfel_texels, texel_codes
 from skindb.schema import FitStatus, TexelStatus, Use, dataset, names_of, variables
@@ -191,13 +191,11 @@ def trusted_surfels(fitted: xr.Dataset) -> Mask:
 def no_surfels_error(model: xr.DataTree) -> InputError:
     """Error for a take without fitted surfels, which a population cannot use."""
     take = str(model.attrs.get("take", model.attrs.get("subject", "take")))
-    return InputError(
-        Fault(
-            take,
-            "a take of a population must have fitted surfels",
-            "none",
-            "skip the take or fit it again",
-        )
+    return input_error(
+        take,
+        "a take of a population must have fitted surfels",
+        "none",
+        "skip the take or fit it again",
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.geometry._texture_kernels import (
     CORNERS,
     average,
@@ -122,13 +122,11 @@ def disc_atlas(
                 report = {"area_log2_sd": spread, "intrinsic": float(intrinsic)}
                 return stored, {"flips": 0.0, **report}
             fewest_flips = min(fewest_flips, flips)
-    raise InputError(
-        Fault(
-            "mesh",
-            "no triangle may be turned over in the atlas",
-            f"{fewest_flips} of {len(fine)}",
-            "remove the smallest triangles from the scan, or choose a wider spacing",
-        )
+    raise input_error(
+        "mesh",
+        "no triangle may be turned over in the atlas",
+        f"{fewest_flips} of {len(fine)}",
+        "remove the smallest triangles from the scan, or choose a wider spacing",
     )
 
 
@@ -163,16 +161,16 @@ def _check(n: int, faces: Index, loops: list[Index]) -> None:
     cure = "cut the scan so that one open surface remains"
     if not loops:
         rule = "a surface must have a boundary to be flattened"
-        raise InputError(Fault("mesh", rule, "a closed surface", cure))
+        raise input_error("mesh", rule, "a closed surface", cure)
     if len(np.unique(faces)) != n or face_components(faces).max() > 0:
         rule = "a surface must be connected to be flattened"
-        raise InputError(
-            Fault("mesh", rule, "several components or unused vertices", "clean it")
+        raise input_error(
+            "mesh", rule, "several components or unused vertices", "clean it"
         )
     handles = (2 - len(loops) - (n - len(edge_table(faces).edges) + len(faces))) // 2
     if handles:
         rule = "a surface must not have handles to be flattened"
-        raise InputError(Fault("mesh", rule, f"{handles} handles", cure))
+        raise input_error("mesh", rule, f"{handles} handles", cure)
 
 
 def _cap_holes(

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.geometry.mesh import (
     boundary_loops,
     edge_table,
@@ -149,13 +149,11 @@ def clean_mesh(
     report.add("slivers_left", points, remaining)
     current = _largest_component(points, current, report)
     if not len(current):
-        raise InputError(
-            Fault(
-                "mesh",
-                "a scan must have a surface",
-                "no non-degenerate face",
-                "export it again",
-            )
+        raise input_error(
+            "mesh",
+            "a scan must have a surface",
+            "no non-degenerate face",
+            "export it again",
         )
     current = _fill_small_holes(points, current, hole_edges, report)
     current, source = _split_bow_ties(current, len(points))

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from trimesh.exchange.ply import load_ply
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 from skindb.files import open_regular
 from skindb.limits import (
     MAX_PLY_TEXT_LINES,
@@ -129,7 +129,7 @@ def _damage(error: Exception) -> str:
 
 
 def _fault(file: Path, rule: str, finding: str) -> InputError:
-    return InputError(Fault(str(file), rule, finding, CURE))
+    return input_error(str(file), rule, finding, CURE)
 
 
 def _faults(file: str, vertices: Array, faces: Index) -> list[Fault]:
@@ -274,14 +274,12 @@ class Crop:
         is_box = self.low is not None and self.high is not None
         if is_box and not np.less(np.array(self.low), np.array(self.high)).all():
             rule = "its lower corner must lie below the higher one, in mm"
-            raise InputError(
-                Fault("crop", rule, f"{self.low} and {self.high}", "exchange them")
+            raise input_error(
+                "crop", rule, f"{self.low} and {self.high}", "exchange them"
             )
         if self.reach_mm is not None and not self.reach_mm > 0:
             rule = "its reach must be positive, in mm"
-            raise InputError(
-                Fault("crop", rule, str(self.reach_mm), "give a positive one")
-            )
+            raise input_error("crop", rule, str(self.reach_mm), "give a positive one")
 
 
 def crop_faces(

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from skindb.calibration.fibres import place_text, placement_signal
-from skindb.errors import Fault, InputError, attempt, require
+from skindb.errors import Fault, InputError, attempt, input_error, require
 from skindb.format.contact_probe import ProbeRecord
 from skindb.format.fields import MAX_MAGNITUDE
 from skindb.format.frames import Digests
@@ -425,14 +425,12 @@ def _require_energy(probe: ProbeRecord, value: Float64, error: Float64) -> None:
     if not (returned > MAX_RETURNED_FRACTION).any():
         return
     site, fibre, _ = np.unravel_index(int(np.nanargmax(returned)), returned.shape)
-    raise InputError(
-        Fault(
-            f"{probe.file}[scale]",
-            f"R at r mm must be at most {MAX_RETURNED_FRACTION:g} / (pi r^2): skin cannot "
-            "return more light",
-            f"{np.nanmax(returned):.3g} / (pi r^2) at fibre {fibre} of {probe.sites[site]}",
-            "correct scale, gain, seconds or distance; use a scale of null if it is unknown",
-        )
+    raise input_error(
+        f"{probe.file}[scale]",
+        f"R at r mm must be at most {MAX_RETURNED_FRACTION:g} / (pi r^2): skin cannot "
+        "return more light",
+        f"{np.nanmax(returned):.3g} / (pi r^2) at fibre {fibre} of {probe.sites[site]}",
+        "correct scale, gain, seconds or distance; use a scale of null if it is unknown",
     )
 
 

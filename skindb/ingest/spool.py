@@ -23,7 +23,7 @@ from typing import Any, Self
 import dask.array as da
 import numpy as np
 
-from skindb.errors import Fault, InputError
+from skindb.errors import InputError, input_error
 from skindb.files import PRIVATE_FILE, make_private, private_file
 from skindb.ingest._sample_kernels import tally
 from skindb.limits import RESUMABLE_SECONDS
@@ -335,13 +335,11 @@ def _locked(folder: Path, *, new: bool = True) -> int:
             pass
         except BlockingIOError:
             os.close(lock)
-            raise InputError(
-                Fault(
-                    str(folder),
-                    "one process ingests a capture",
-                    "another one does",
-                    "wait until the other one has ended",
-                )
+            raise input_error(
+                str(folder),
+                "one process ingests a capture",
+                "another one does",
+                "wait until the other one has ended",
             ) from None
         except OSError:
             os.close(lock)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 from skindb.files import package_json, private_file
 from skindb.optics.angles import half_difference
 from skindb.reflectance.dictionary import (
@@ -97,13 +97,11 @@ def read_tables(path: str | Path) -> Dictionary:
     table = np.stack([table for table, _ in resampled], axis=-1)
     albedo = directional_albedo(table, 1.0)[0]
     if albedo.max() > 2:  # more than an error of measurement explains
-        raise InputError(
-            Fault(
-                f"{path}[{TABLE}]",
-                "a surface must not reflect more light than it receives",
-                f"an albedo of {albedo.max():.3g} at normal incidence",
-                "provide values in sr^-1",
-            )
+        raise input_error(
+            f"{path}[{TABLE}]",
+            "a surface must not reflect more light than it receives",
+            f"an albedo of {albedo.max():.3g} at normal incidence",
+            "provide values in sr^-1",
         )
     names = (
         tuple(map(str, arrays["names"]))
@@ -143,30 +141,24 @@ def _load(path: Path) -> dict[str, AnyArray]:
             arrays = {name: file[name] for name in file.files}
     except OSError as error:
         rule = "must be a folder of MERL .binary files or an .npz file of BRDF tables"
-        raise InputError(
-            Fault(
-                str(path), rule, str(error.strerror or "another file"), "check the path"
-            )
+        raise input_error(
+            str(path), rule, str(error.strerror or "another file"), "check the path"
         ) from None
     except (ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile):
-        raise InputError(
-            Fault(
-                str(path),
-                "must be an .npz file of plain arrays",
-                "another file",
-                "write it with skindb.reflectance.brdf_files.write_tables or numpy.savez",
-            )
+        raise input_error(
+            str(path),
+            "must be an .npz file of plain arrays",
+            "another file",
+            "write it with skindb.reflectance.brdf_files.write_tables or numpy.savez",
         ) from None
     missing = [name for name in (TABLE, *NODES) if name not in arrays]
     if missing:
         rule = f"must contain {TABLE} and its nodes {', '.join(NODES)}"
-        raise InputError(
-            Fault(
-                str(path),
-                rule,
-                f"no {', '.join(missing)}",
-                "add them, in sr^-1 and rad",
-            )
+        raise input_error(
+            str(path),
+            rule,
+            f"no {', '.join(missing)}",
+            "add them, in sr^-1 and rad",
         )
     wrong = [name for name in (TABLE, *NODES) if arrays[name].dtype.kind not in "fiu"]
     if wrong:
@@ -391,24 +383,22 @@ def read_merl(path: str | Path) -> tuple[Array, int]:
     if dims != SHAPE or len(data) != want:
         content = f"the header {dims} and {len(data)} bytes"
         rule = f"a MERL binary must have the header {SHAPE} and {want} bytes"
-        raise InputError(Fault(str(path), rule, content, "download it again"))
+        raise input_error(str(path), rule, content, "download it again")
     values = np.frombuffer(data[12:], "<f8").reshape(3, *SHAPE)
     wrong = int((~np.isfinite(values)).sum())
     if wrong:
-        raise InputError(
-            Fault(
-                str(path),
-                "values must be finite",
-                f"{wrong} that are not",
-                "download it again",
-            )
+        raise input_error(
+            str(path),
+            "values must be finite",
+            f"{wrong} that are not",
+            "download it again",
         )
     table = np.moveaxis(values, 0, -1) * SCALE
     hole = np.asarray((table < 0).any(axis=-1))
     if hole.all():
         rule = "some cells must be measured"
         content = "only negative values"
-        raise InputError(Fault(str(path), rule, content, "download it again"))
+        raise input_error(str(path), rule, content, "download it again")
     return np.where(hole[..., None], np.nan, table), int(hole.sum())
 
 
@@ -441,13 +431,11 @@ def read_merl_folder(path: str | Path) -> Dictionary:
     """
     files = sorted(Path(path).glob("*.binary"))
     if not files:
-        raise InputError(
-            Fault(
-                str(path),
-                "the folder must contain MERL .binary files",
-                "none",
-                "choose their folder, or an .npz file of tables",
-            )
+        raise input_error(
+            str(path),
+            "the folder must contain MERL .binary files",
+            "none",
+            "choose their folder, or an .npz file of tables",
         )
     # centres of bins; theta_h is quadratic
     h, d, p = ((np.arange(n) + 0.5) / n for n in SHAPE)

@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 
 from skindb.cache import cached_arrays
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.files import package_json
 from skindb.optics.angles import directions, half_difference
 from skindb.optics.fresnel import fresnel_reflectance
@@ -325,14 +325,12 @@ def convolve_disc(
     before = dictionary.disc_angular_radius
     # the fit rounds to a hundredth of a degree
     if before and abs(before - angular_radius) > np.radians(0.0101):
-        raise InputError(
-            Fault(
-                dictionary.source,
-                "tables must be for point lights or for the disc of these lights, "
-                f"{np.degrees(angular_radius):.2f} degrees",
-                f"a disc of {np.degrees(before):.2f} degrees",
-                "provide tables for point lights",
-            )
+        raise input_error(
+            dictionary.source,
+            "tables must be for point lights or for the disc of these lights, "
+            f"{np.degrees(angular_radius):.2f} degrees",
+            f"a disc of {np.degrees(before):.2f} degrees",
+            "provide tables for point lights",
         )
     if before or angular_radius <= 0:
         return dictionary

@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 import xarray as xr
 
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.reflectance import _ggx_kernels
 from skindb.reflectance._ggx_kernels import (
     MAX_ROUGHNESS,
@@ -94,13 +94,11 @@ class GGX:
     def unfitted(cls, request: FitRequest) -> GGX:
         """The model before a fit; there is none of a dictionary."""
         if request.dictionary is not None:
-            raise InputError(
-                Fault(
-                    "dictionary",
-                    "mixtures alone are of a dictionary",
-                    "ggx",
-                    "omit it, or fit a mixture",
-                )
+            raise input_error(
+                "dictionary",
+                "mixtures alone are of a dictionary",
+                "ggx",
+                "omit it, or fit a mixture",
             )
         return cls(request.eta, request.disc_angular_radius)
 

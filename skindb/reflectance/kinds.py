@@ -7,7 +7,7 @@ from collections.abc import Container
 import numpy as np
 import xarray as xr
 
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.reflectance.ggx import GGX
 from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.model import FitRequest, ReflectanceModel, SurfaceKind
@@ -82,11 +82,9 @@ def as_mixture(model: xr.DataTree) -> xr.DataTree:
 def require_mixture(names: Container[object], place: str) -> None:
     """Raise `InputError` unless `names` has the weights of a dictionary."""
     if "dictionary_weight" not in names and "dictionary" not in names:
-        raise InputError(
-            Fault(
-                place,
-                "edits and studies of BRDFs need mixtures of measured BRDFs",
-                "another surface model",
-                "fit with --surface mixture",
-            )
+        raise input_error(
+            place,
+            "edits and studies of BRDFs need mixtures of measured BRDFs",
+            "another surface model",
+            "fit with --surface mixture",
         )

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 import xarray as xr
 
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.reflectance import _row_kernels
 from skindb.reflectance._block_kernels import Tables, fit_block, judge_block
 from skindb.reflectance.block import (
@@ -123,13 +123,11 @@ class Mixture:
         tables = disc_dictionary(request.dictionary, request.disc_angular_radius)
         count = len(tables.names)
         if request.k > count:  # checked before the fit
-            raise InputError(
-                Fault(
-                    "k",
-                    f"a reduced basis of this dictionary has 1 to {count} components",
-                    str(request.k),
-                    "choose a smaller k",
-                )
+            raise input_error(
+                "k",
+                f"a reduced basis of this dictionary has 1 to {count} components",
+                str(request.k),
+                "choose a smaller k",
             )
         return cls.of_dictionary(tables, rank=request.rank)
 

@@ -24,7 +24,7 @@ import xarray as xr
 from scipy.optimize import minimize
 
 from skindb.cache import cached_arrays
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.numerics.factorise import nmf
 from skindb.numerics.nnls import solve_nnls
 from skindb.optics.angles import directions
@@ -300,13 +300,11 @@ def reduce_basis(
     area = np.maximum(fitted["surfel_area"].values.astype(np.float64), 0) + 1e-12
     limit = min(len(good), weight.shape[1])
     if not 1 <= k <= limit:
-        raise InputError(
-            Fault(
-                "k",
-                f"a reduced basis has 1 to {limit} components here",
-                str(k),
-                "choose another k",
-            )
+        raise input_error(
+            "k",
+            f"a reduced basis has 1 to {limit} components here",
+            str(k),
+            "choose another k",
         )
     chosen = good[
         np.sort(
@@ -367,13 +365,11 @@ def fitted_surfels(fitted: xr.Dataset, names: Sequence[str]) -> Index:
             f"{n} {FitStatus(s).name.lower()}"
             for s, n in zip(status, count, strict=True)
         )
-        raise InputError(
-            Fault(
-                "fitted[fit_status]",
-                "a basis needs fitted surfels",
-                counts_by_status,
-                "add lights and cameras, or hold fewer out",
-            )
+        raise input_error(
+            "fitted[fit_status]",
+            "a basis needs fitted surfels",
+            counts_by_status,
+            "add lights and cameras, or hold fewer out",
         )
     return np.flatnonzero(good)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.files import private_file
 from skindb.geometry.rays import RayScene
 from skindb.render.image import encode_srgb
@@ -211,13 +211,11 @@ def write_field(
     having = [kind for kind, tree in trees.items() if variable in _drawable(tree)]
     if not having:
         names = ", ".join(sorted(set().union(*map(_drawable, trees.values()))))
-        raise InputError(
-            Fault(
-                "variable",
-                "must be a variable of the surfels",
-                variable,
-                f"choose {names}",
-            )
+        raise input_error(
+            "variable",
+            "must be a variable of the surfels",
+            variable,
+            f"choose {names}",
         )
     tree = trees[having[0]]
     figure = field_figure(tree, variable, at=at)
@@ -326,9 +324,7 @@ def _find(take: xr.DataTree, variable: str) -> tuple[xr.Dataset, xr.DataArray]:
                 variable
             ]
     cure = "choose " + ", ".join(sorted(_drawable(take)))
-    raise InputError(
-        Fault("variable", "must be a variable of the surfels", variable, cure)
-    )
+    raise input_error("variable", "must be a variable of the surfels", variable, cure)
 
 
 def _drawable(take: xr.DataTree) -> set[str]:
@@ -357,20 +353,18 @@ def _chosen(
                 + ", ".join(labels[:12])
                 + (", ..." if len(labels) > 12 else "")
             )
-            raise InputError(
-                Fault("at", f"must select one {dim} of {values.name}", choice, cure)
+            raise input_error(
+                "at", f"must select one {dim} of {values.name}", choice, cure
             )
         values = values.isel({dim: labels.index(at.pop(dim))})
     if at:
         dims = ", ".join(map(str, values.dims))
         cure = "remove the others"
-        raise InputError(
-            Fault(
-                "at",
-                f"must name dimensions of {values.name}, which has {dims}",
-                ", ".join(at),
-                cure,
-            )
+        raise input_error(
+            "at",
+            f"must name dimensions of {values.name}, which has {dims}",
+            ", ".join(at),
+            cure,
         )
     return values
 

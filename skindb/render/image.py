@@ -10,7 +10,7 @@ import numpy as np
 import OpenEXR
 from numpy.typing import ArrayLike
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 from skindb.files import private_file
 from skindb.types import AnyArray, Bytes, Float32, Float64, Mask
 
@@ -92,8 +92,8 @@ def read_png(path: str | Path) -> AnyArray:
     try:
         return np.asarray(imagecodecs.png_decode(_bytes(path)))
     except (ValueError, RuntimeError):  # RuntimeError comes from the decoder
-        raise InputError(
-            Fault(str(path), "must be a PNG image", DAMAGED, "write the file again")
+        raise input_error(
+            str(path), "must be a PNG image", DAMAGED, "write the file again"
         ) from None
 
 
@@ -137,13 +137,11 @@ def read_exr(path: str | Path) -> tuple[Image, tuple[str, ...]]:
                 for name, plane in file.channels().items()
             }
     except (RuntimeError, ValueError, UserWarning):
-        raise InputError(
-            Fault(
-                str(path),
-                "must be a complete OpenEXR image",
-                DAMAGED,
-                "convert other formats to OpenEXR; write a damaged file again",
-            )
+        raise input_error(
+            str(path),
+            "must be a complete OpenEXR image",
+            DAMAGED,
+            "convert other formats to OpenEXR; write a damaged file again",
         ) from None
     colour = [name for name in "RGBA" if name in planes]
     names = (*colour, *sorted(set(planes) - set(colour)))

@@ -15,7 +15,7 @@ from scipy import ndimage
 from scipy.ndimage import binary_erosion
 from skimage.metrics import structural_similarity
 
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.files import make_private
 from skindb.geometry.rays import RayScene
 from skindb.render.image import auto_exposure, encode_srgb, tone_map, write_png
@@ -369,13 +369,11 @@ def compare_photographs(
         taken = _Taken(photo, diffuse, gloss, mask)
         results.append(taken.compared(light, name, is_unseen, view, regions, doubtful))
     if not results:
-        raise InputError(
-            Fault(
-                "photographs",
-                "at least one must show the face",
-                "none",
-                "ingest the capture again with more --photographs",
-            )
+        raise input_error(
+            "photographs",
+            "at least one must show the face",
+            "none",
+            "ingest the capture again with more --photographs",
         )
     return results
 
@@ -389,13 +387,11 @@ def _kept_photographs(capture: xr.DataTree) -> list[xr.Dataset]:
         If ingest kept none.
     """
     if "photographs" not in capture.children:
-        raise InputError(
-            Fault(
-                "capture",
-                "must contain kept photographs",
-                "none",
-                "ingest the capture again with --photographs 4",
-            )
+        raise input_error(
+            "capture",
+            "must contain kept photographs",
+            "none",
+            "ingest the capture again with --photographs 4",
         )
     photographs = capture["photographs"].to_dataset()
     needed = (

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.geometry.interreflection import bounce_transfer
 from skindb.geometry.mesh import vertex_normals
 from skindb.limits import MAX_PICTURE_PIXELS
@@ -107,13 +107,11 @@ class Camera:
         width = round(self.width * factor)
         height = round(self.height * factor)
         if not 1 <= width * height <= MAX_PICTURE_PIXELS:
-            raise InputError(
-                Fault(
-                    "scale",
-                    f"a picture must have 1 to {MAX_PICTURE_PIXELS:,} pixels",
-                    f"{width} x {height}",
-                    "choose a smaller scale",
-                )
+            raise input_error(
+                "scale",
+                f"a picture must have 1 to {MAX_PICTURE_PIXELS:,} pixels",
+                f"{width} x {height}",
+                "choose a smaller scale",
             )
         K = np.diag([factor, factor, 1.0]) @ self.K
         return replace(self, K=K, width=width, height=height)
@@ -207,13 +205,11 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
     position = values.pop(variables.SURFEL_POSITION)
     usable = usable_surfels(values)
     if not usable.any():
-        raise InputError(
-            Fault(
-                "fitted[fit_status]",
-                "at least one surfel must be fitted for a picture",
-                "none",
-                "see the report of the fit",
-            )
+        raise input_error(
+            "fitted[fit_status]",
+            "at least one surfel must be fitted for a picture",
+            "none",
+            "see the report of the fit",
         )
     del values[variables.FIT_STATUS]
     if fill:
@@ -308,15 +304,13 @@ def subdivide_surface(surface: Surface, spacing: float, visible: Mask) -> Surfac
         if not len(chosen):
             break
         if len(vertices) + 3 * len(chosen) > MAX_VERTICES:
-            raise InputError(
-                Fault(
-                    "spacing",
-                    "the part of the face in the picture must have at most "
-                    f"{MAX_VERTICES:,} vertices",
-                    f"{len(vertices):,} and {len(chosen):,} triangles that are still "
-                    f"coarser than {spacing:g} mm",
-                    "choose a larger spacing, or a closer picture",
-                )
+            raise input_error(
+                "spacing",
+                "the part of the face in the picture must have at most "
+                f"{MAX_VERTICES:,} vertices",
+                f"{len(vertices):,} and {len(chosen):,} triangles that are still "
+                f"coarser than {spacing:g} mm",
+                "choose a larger spacing, or a closer picture",
             )
         vertices, faces, values = trimesh.remesh.subdivide(
             vertices, faces, chosen, vertex_attributes=values
@@ -355,7 +349,7 @@ class Environment:
         if names[:3] != ("R", "G", "B"):
             rule = "an environment must have the channels R, G and B"
             cure = "write it as an RGB image"
-            raise InputError(Fault(str(path), rule, ", ".join(names), cure))
+            raise input_error(str(path), rule, ", ".join(names), cure)
         values = pixels[..., :3].astype(np.float64)
         finite = np.isfinite(values)
         height, width = values.shape[:2]
@@ -364,10 +358,8 @@ class Environment:
                 "a latitude-longitude image of all directions must be twice as wide as "
                 "it is high"
             )
-            raise InputError(
-                Fault(
-                    str(path), rule, f"{width} x {height} pixels", "convert the image"
-                )
+            raise input_error(
+                str(path), rule, f"{width} x {height} pixels", "convert the image"
             )
         if not finite.all() or values.min() < 0 or values.max() == 0:
             rule = "radiance must be finite, not negative, and not zero everywhere"
@@ -377,7 +369,7 @@ class Environment:
                 f"{int((values < 0).sum())} negative ones"
             )
             fault = "zero everywhere" if finite.all() and not values.any() else fault
-            raise InputError(Fault(str(path), rule, fault, cure))
+            raise input_error(str(path), rule, fault, cure)
         return cls(values)
 
     def along(self, direction: Array) -> Array:

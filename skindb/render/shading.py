@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.geometry.camera import pixel_rays
 from skindb.geometry.mesh import vertex_areas
 from skindb.geometry.rays import RayScene
@@ -39,13 +39,11 @@ def require_translucency(surface: Surface) -> None:
     if missing := [
         channel for c, channel in enumerate("RGB") if not finite[:, c].any()
     ]:
-        raise InputError(
-            Fault(
-                "model",
-                "must have sigma_tr in R, G and B for subsurface transport",
-                f"no probe site with a valid fit in {', '.join(missing)}",
-                "omit --subsurface, or repeat the probe measurement",
-            )
+        raise input_error(
+            "model",
+            "must have sigma_tr in R, G and B for subsurface transport",
+            f"no probe site with a valid fit in {', '.join(missing)}",
+            "omit --subsurface, or repeat the probe measurement",
         )
 
 

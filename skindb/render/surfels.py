@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error
 from skindb.geometry.interreflection import tangent_frames
 from skindb.reflectance.kinds import even_diffuse, surface_model
 from skindb.reflectance.model import Lamp, Points, ReflectanceModel
@@ -81,13 +81,11 @@ def surfel_confidence(fitted: xr.Dataset) -> Float32:
     """(n,) 1 for fitted surfels, 0.5 for doubtful fits, 0 for all others."""
     trust: Float32 = TRUST[surfel_texels(fitted)]
     if not trust.any():
-        raise InputError(
-            Fault(
-                "fitted[fit_status]",
-                "at least one surfel must be fitted for an export",
-                "none",
-                "see the report of the fit",
-            )
+        raise input_error(
+            "fitted[fit_status]",
+            "at least one surfel must be fitted for an export",
+            "none",
+            "see the report of the fit",
         )
     return trust
 
@@ -309,13 +307,11 @@ def _values_of(
     """
     count = fitted.sizes["surfel"]
     if not 0 <= surfel < count:
-        raise InputError(
-            Fault(
-                "surfel",
-                f"surfel must be an index from 0 to {count - 1}",
-                str(surfel),
-                "choose a surfel of this model",
-            )
+        raise input_error(
+            "surfel",
+            f"surfel must be an index from 0 to {count - 1}",
+            str(surfel),
+            "choose a surfel of this model",
         )
     names = [*NEEDED, *reflectance.parameter_variables]
     names += [variables.EVEN_REFLECTION] * (variables.EVEN_REFLECTION in fitted)
@@ -325,13 +321,11 @@ def _values_of(
     values["parameters"] = reflectance.parameters_of(row)
     if not usable_surfels(values)[0]:
         status = FitStatus(int(values[variables.FIT_STATUS][0]))
-        raise InputError(
-            Fault(
-                f"fitted[fit_status] of surfel {surfel}",
-                "the surfel must be fitted",
-                f"the status {status.name} ({status.explanation})",
-                "choose a surfel whose fit_status is FITTED",
-            )
+        raise input_error(
+            f"fitted[fit_status] of surfel {surfel}",
+            "the surfel must be fitted",
+            f"the status {status.name} ({status.explanation})",
+            "choose a surfel whose fit_status is FITTED",
         )
     return values
 
@@ -340,25 +334,21 @@ def _unit(name: str, direction: ArrayLike) -> Array:
     """Directions (..., 3) in double precision, checked to be unit vectors and then normalised."""
     vectors = np.asarray(direction, np.float64)
     if vectors.ndim == 0 or vectors.shape[-1] != 3:
-        raise InputError(
-            Fault(
-                name,
-                "directions must have the shape (..., 3)",
-                f"the shape {vectors.shape}",
-                "put x, y, z last",
-            )
+        raise input_error(
+            name,
+            "directions must have the shape (..., 3)",
+            f"the shape {vectors.shape}",
+            "put x, y, z last",
         )
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     if not (np.abs(length - 1) < MAX_LENGTH_ERROR).all():
         worst = length.flat[
             np.argmax(np.where(np.isfinite(length), np.abs(length - 1), np.inf))
         ]
-        raise InputError(
-            Fault(
-                name,
-                "directions must be unit vectors",
-                f"a length of {worst:.4g}",
-                "normalise them",
-            )
+        raise input_error(
+            name,
+            "directions must be unit vectors",
+            f"a length of {worst:.4g}",
+            "normalise them",
         )
     return np.asarray(vectors / length)

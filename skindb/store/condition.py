@@ -18,7 +18,7 @@ from datetime import UTC, date, datetime
 from itertools import pairwise
 from typing import Any
 
-from skindb.errors import Fault, InputError, input_error
+from skindb.errors import InputError, input_error
 
 MAX_CHARACTERS = 1_000
 MAX_DEPTH = 16  # of nested conditions
@@ -288,8 +288,8 @@ class _Evaluation:
 
     def fault(self, rule: str, finding: str, cure: str) -> InputError:
         """Error of this condition."""
-        return InputError(
-            Fault("where", f"a condition {rule}", f"{finding} in {self.text!r}", cure)
+        return input_error(
+            "where", f"a condition {rule}", f"{finding} in {self.text!r}", cure
         )
 
 

@@ -143,13 +143,11 @@ class Snapshot:
         finding = f"takes: {', '.join(takes)}"
         if not takes:
             finding = f"no {kind}; kinds: {', '.join(self.kinds()) or 'none'}"
-        return InputError(
-            Fault(
-                f"{self.place.name}: {kind} of {take}",
-                "the database must hold it",
-                finding,
-                "see skindb info",
-            )
+        return input_error(
+            f"{self.place.name}: {kind} of {take}",
+            "the database must hold it",
+            finding,
+            "see skindb info",
         )
 
 

@@ -272,13 +272,11 @@ class VerifiedStore(ListedStore):
             raise InputError(faults)
 
     def _fault(self, key: str, finding: str) -> InputError:
-        return InputError(
-            Fault(
-                self.place.where(f"{self.record.path}/{key}"),
-                AS_COMMITTED,
-                finding,
-                CURE,
-            )
+        return input_error(
+            self.place.where(f"{self.record.path}/{key}"),
+            AS_COMMITTED,
+            finding,
+            CURE,
         )
 
 
