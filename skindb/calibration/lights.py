@@ -58,6 +58,7 @@ THREADS = 2
 # between lights of one rig: more than the rounding of files, less than a lamp that was moved
 SAME_POSITION_MM = 1.0
 SAME_ANGLE = float(np.radians(0.1))
+SAME_FRACTION = 0.8  # a few lamps may have failed
 
 
 @dataclass(frozen=True)
@@ -482,14 +483,29 @@ def calibrated_dome(
 def is_same_rig(
     positions: Mapping[str, Float64], others: Mapping[str, Float64]
 ) -> bool:
-    """Whether two sets of lights have the same ids, and positions (3,) mm that differ by
-    at most 1 mm, or 0.1 degrees as seen from the origin.
+    """Whether two sets of lights are of one rig, see `moved_lights`: at least 80 % of
+    the smaller set are in both, and none of these is elsewhere.
     """
-    return positions.keys() == others.keys() and all(
-        np.linalg.norm(position - others[name])
-        <= max(SAME_POSITION_MM, SAME_ANGLE * float(np.linalg.norm(position)))
-        for name, position in positions.items()
+    shared = positions.keys() & others.keys()
+    smaller = min(len(positions), len(others))
+    return len(shared) >= SAME_FRACTION * smaller > 0 and not moved_lights(
+        positions, others
     )
+
+
+def moved_lights(
+    positions: Mapping[str, Float64], others: Mapping[str, Float64]
+) -> list[str]:
+    """Ids that are in both sets of lights, with positions (3,) mm that differ by more
+    than 1 mm, and 0.1 degrees as seen from the origin.
+    """
+    return [
+        name
+        for name, position in positions.items()
+        if name in others
+        and np.linalg.norm(position - others[name])
+        > max(SAME_POSITION_MM, SAME_ANGLE * float(np.linalg.norm(position)))
+    ]
 
 
 def rig_positions(rig: xr.Dataset) -> dict[str, Float64]:
@@ -499,7 +515,8 @@ def rig_positions(rig: xr.Dataset) -> dict[str, Float64]:
 
 
 def rig_dome(dome: DomeRecord, calibration: xr.Dataset, *, where: str) -> DomeRecord:
-    """The dome with the gains and offsets of the lights by a calibration from takes.
+    """The dome with the gains and offsets of the lights by a calibration from takes; lights
+    that it does not have keep their own.
 
     Raises
     ------
@@ -512,13 +529,15 @@ def rig_dome(dome: DomeRecord, calibration: xr.Dataset, *, where: str) -> DomeRe
             rig_positions(calibration),
         ),
         where,
-        "a calibration from takes applies to captures with its lights, within "
-        f"{SAME_POSITION_MM:g} mm or {np.degrees(SAME_ANGLE):.1f} degrees",
+        "a calibration from takes applies to captures with its lights, at least "
+        f"{SAME_FRACTION:.0%} of them, within {SAME_POSITION_MM:g} mm or "
+        f"{np.degrees(SAME_ANGLE):.1f} degrees",
         "other ids or positions of the lights",
         "remove the key calibration of capture.json, or calibrate from takes of this dome",
     )
-    own = calibration.sel(light=[light.id for light in dome.lights])
-    gains, offsets = (own[f"rig_light_{name}"].values for name in ("gain", "offset"))
+    own = calibration.reindex(light=[light.id for light in dome.lights])
+    gains = own["rig_light_gain"].fillna(1.0).values
+    offsets = own["rig_light_offset"].fillna(0.0).values
     lights = (
         replace(
             light,

@@ -117,13 +117,19 @@ class LightResiduals:
     axes: Array  # (2, light, 3) mm/rad across the directions to the lights
     applied: LightErrors  # with which the samples were made
 
-    def of_lights(self, order: list[int]) -> LightResiduals:
-        """The same for the lights in another order."""
-        index = (np.arange(3)[:, None] * len(order) + order).ravel()
-        applied = LightErrors(*(values[order] for values in self.applied))
-        return LightResiduals(
-            self.form[np.ix_(index, index)], self.axes[:, order], applied
-        )
+    def of_lights(self, places: Sequence[int], lights: int) -> LightResiduals:
+        """The same among the lights of a rig, in which they have some of the places; the
+        take knows nothing of the others.
+        """
+        place = np.array(places)
+        index = (np.arange(3)[:, None] * lights + place).ravel()
+        form = np.zeros((3 * lights, 3 * lights))
+        form[np.ix_(index, index)] = self.form
+        axes = np.ones((2, lights, 3))
+        axes[:, place] = self.axes
+        gain, offset = np.ones(lights), np.zeros((lights, 3))
+        gain[place], offset[place] = self.applied
+        return LightResiduals(form, axes, LightErrors(gain, offset))
 
     def errors(self, *, turned: bool) -> LightErrors:
         """Gains, and offsets if `turned` or else those that were applied, with the

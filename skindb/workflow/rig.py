@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb.calibration.lights import is_same_rig
+from skindb.calibration.lights import is_same_rig, moved_lights
 from skindb.errors import input_error, require
 from skindb.fit.corrections import LightResiduals
 from skindb.fit.rig import MIN_TAKES, common_light_errors, take_light_residuals
@@ -72,7 +72,7 @@ def calibrate_rig(
         "ingest and fit more takes of the rig",
     )
     inputs = list[Record]()
-    residuals = list[LightResiduals]()
+    residuals = list[tuple[LightResiduals, dict[str, Float64]]]()
     positions = dict[str, Float64]()
     for number, (take, model) in enumerate(models.items()):
         progress("lights", number, len(models))
@@ -81,13 +81,20 @@ def calibrate_rig(
         lights = _lights(record, capture)
         positions = positions or lights
         _require_rig(positions, lights, take=take, first=next(iter(models)))
+        positions = lights | positions
         rng = np.random.default_rng([seed, number])
         fitted = db.read("model", take, generation=model.generation)
         own = take_light_residuals(capture, fitted, rng=rng)
-        residuals.append(own.of_lights([[*lights].index(name) for name in positions]))
+        residuals.append((own, lights))
         inputs += [record, model]
+    names = [*positions]
     group = common_light_errors(
-        residuals, lights=[*positions], positions=np.array([*positions.values()])
+        [
+            own.of_lights([names.index(light) for light in lights], len(names))
+            for own, lights in residuals
+        ],
+        lights=names,
+        positions=np.array([*positions.values()]),
     )
     _require_help(group)
     progress("lights", len(models), len(models))
@@ -189,20 +196,13 @@ def _require_rig(
     """Require the lights of another take of the rig."""
     if is_same_rig(positions, lights):
         return
-    other = positions.keys() ^ lights.keys()
-    name = (
-        min(other)
-        if other
-        else next(
-            light
-            for light, position in positions.items()
-            if not is_same_rig({light: position}, {light: lights[light]})
-        )
-    )
+    moved = moved_lights(positions, lights)
     raise input_error(
         take,
-        f"takes of one rig must have the lights of {first}",
-        f"light {name} in one of them only" if other else f"light {name} elsewhere",
+        f"takes of one rig must have most of the lights of {first}, at the same places",
+        f"light {moved[0]} elsewhere"
+        if moved
+        else f"{len(positions.keys() & lights.keys())} of its {len(lights)} lights in both",
         "name the takes of one rig",
     )
 
