@@ -209,16 +209,17 @@ def ingest(
         progress=progress,
         **asdict(parameters),
     )
-    work: dict[str, Any] = {
-        "workers": workers,
-        "scheduler": scheduler,
-        "shared": database.folder,
-    }
     finish = partial(_ingested, database, explain=explain)
     folders = [shared_path(folder, scheduler) for folder in captures]
     with _logged(database, folders):
         results, faults = each_take(
-            call, folders, **work, progress=progress, finish=finish
+            call,
+            folders,
+            workers=workers,
+            scheduler=scheduler,
+            shared=database.folder,
+            progress=progress,
+            finish=finish,
         )
     if faults and len(captures) > 1:
         echo(f"{len(results)} of {len(captures)} captures were ingested", err=True)

@@ -102,11 +102,6 @@ def fit(
         wait=wait,
     )
     call = partial(how, database, progress=progress)
-    work: dict[str, Any] = {
-        "workers": workers,
-        "scheduler": scheduler,
-        "shared": database.folder,
-    }
     finish = partial(_finished, database)
     results: dict[str, Any] = {}
     faults: list[Fault] = []
@@ -117,7 +112,13 @@ def fit(
             database, "fit", chosen, arguments={"refit": refit, "explain": explain}
         ):
             results, faults = each_take(
-                call, chosen, **work, progress=progress, finish=finish
+                call,
+                chosen,
+                workers=workers,
+                scheduler=scheduler,
+                shared=database.folder,
+                progress=progress,
+                finish=finish,
             )
     else:
         echo(_nothing_to_fit(database, refit=refit), err=True)

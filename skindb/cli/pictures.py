@@ -93,9 +93,15 @@ def render(
         **vars(parameters),
     )
     finish = partial(_rendered, explain=request["explain"], error=parameters.error)
-    work: dict[str, Any] = {"workers": workers, "scheduler": scheduler}
     with skindb.workflow.logged_action(database, "render", chosen, arguments=request):
-        results, faults = each_take(call, chosen, **work, progress=bar(), finish=finish)
+        results, faults = each_take(
+            call,
+            chosen,
+            workers=workers,
+            scheduler=scheduler,
+            progress=bar(),
+            finish=finish,
+        )
     emit(results, [], faults)
 
 
@@ -257,10 +263,14 @@ def export(
         progress=progress,
         **options,
     )
-    work: dict[str, Any] = {"workers": workers, "scheduler": scheduler}
     with skindb.workflow.logged_action(database, "export", chosen, arguments=options):
         results, faults = each_take(
-            call, chosen, **work, progress=progress, finish=_exported
+            call,
+            chosen,
+            workers=workers,
+            scheduler=scheduler,
+            progress=progress,
+            finish=_exported,
         )
     emit(results, [], faults)
 

@@ -151,13 +151,13 @@ def refresh(
     else:
         dictionary = shared_path(dictionary, scheduler)
         with client_of(scheduler, progress) as client:
-            engine: dict[str, Any] = {
-                "workers": workers,
-                "client": client,
-                "wait": wait,
-            }
             results = workflow.refresh(
-                database, dictionary=dictionary, **engine, progress=progress
+                database,
+                dictionary=dictionary,
+                workers=workers,
+                client=client,
+                wait=wait,
+                progress=progress,
             )
     lines = [_line(result) for result in results] or ["every result is up to date"]
     # refresh has no folders to ingest from

@@ -12,10 +12,10 @@ import numpy as np
 import xarray as xr
 
 from skindb import __version__
-from skindb.export.textures import Skin, shading_normals
+from skindb.export.textures import Skin, unit_normals
 from skindb.files import make_private, private_file
 from skindb.schema import variables
-from skindb.types import Array, Float64
+from skindb.types import Array
 
 STAGE = "face.usda"
 MATERIAL = "face.mtlx"
@@ -169,7 +169,7 @@ def _usda(
         extent=_vectors(np.stack([place.min(axis=0), place.max(axis=0)])),
         counts=", ".join(["3"] * len(triangles)),
         indices=", ".join(map(str, triangles.ravel().tolist())),
-        normals=_vectors(_normals(fitted)),
+        normals=_vectors(unit_normals(fitted, variables.SURFEL_NORMAL)),
         points=_vectors(place),
         uv=_vectors(uv),
         shaders="\n".join([*_openpbr(inputs), *_preview(ior)]),
@@ -276,13 +276,6 @@ def _vectors(values: Array) -> str:
     return f"[{', '.join(f'({numbers})' for numbers in tuples)}]"
 
 
-def _normals(fitted: xr.Dataset) -> Float64:
-    normal = fitted[variables.SURFEL_NORMAL].values.astype(float)
-    return np.asarray(
-        normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    )
-
-
 def export_mitsuba(model: xr.DataTree, folder: Path) -> None:
     """Write `face.ply` and `skin.py` into a new folder beside the maps and bases of a bundle.
 
@@ -300,7 +293,7 @@ def export_mitsuba(model: xr.DataTree, folder: Path) -> None:
     triangles = model["mesh"].to_dataset()[variables.TRIANGLE].values
     columns = [
         fitted[variables.SURFEL_POSITION].values,
-        shading_normals(fitted),
+        unit_normals(fitted, variables.SHADING_NORMAL),
         fitted[variables.SURFEL_UV].values,
     ]
     vertices = np.concatenate(columns, axis=1).astype("<f4")

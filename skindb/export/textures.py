@@ -468,7 +468,7 @@ def _shape(fitted: xr.Dataset, triangles: AnyArray) -> Shape:
     place = fitted[variables.SURFEL_POSITION].values
     uv = fitted[variables.SURFEL_UV].values.astype(np.float32)
     normal, shading = (
-        _unit(fitted, name)
+        unit_normals(fitted, name)
         for name in (variables.SURFEL_NORMAL, variables.SHADING_NORMAL)
     )
     tangent = tangent_frames(place, normal, uv, triangles)
@@ -577,7 +577,7 @@ def _normal_error(picture: Bytes, shape: Shape, surfels: Index) -> float:
     return float(np.degrees(np.median(np.arccos(cosine))))
 
 
-def _unit(fitted: xr.Dataset, name: str) -> Float64:
+def unit_normals(fitted: xr.Dataset, name: str) -> Float64:
     """Unit normals (n, 3) in a variable; those of the scan where they are unknown."""
     normal = fitted[name].values.astype(float)
     normal = np.where(
@@ -587,8 +587,3 @@ def _unit(fitted: xr.Dataset, name: str) -> Float64:
     )
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     return np.where(length > 1e-6, normal / np.maximum(length, 1e-6), [0.0, 0.0, 1.0])
-
-
-def shading_normals(fitted: xr.Dataset) -> Float64:
-    """Unit shading normals (n, 3) of the surfels; those of the scan where they are unknown."""
-    return _unit(fitted, variables.SHADING_NORMAL)

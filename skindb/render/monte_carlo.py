@@ -19,9 +19,9 @@ from skindb.render.scene import Camera, Environment, Lights, Surface
 from skindb.render.shading import (
     View,
     bounced_exitance,
-    entering_light,
     escape_factor,
     exitance_from_irradiance,
+    received_light,
     seen_points,
     trace_view,
     transmitted_irradiance,
@@ -345,19 +345,11 @@ class _Painter:
     ) -> Array:
         received = np.zeros((len(points), 3))
         for i in range(len(lights)):
-            towards = points_on_discs(lights, np.full(len(points), i), rng) - points
-            square = np.einsum("nc,nc->n", towards, towards)
-            cosine = np.einsum("nc,nc->n", towards, normals) / np.sqrt(square)
-            front = np.flatnonzero(cosine > 0)
-            lit = front[
-                ~self.scene.occluded(
-                    points[front], points[front] + towards[front], normal=normals[front]
-                )
-            ]
-            light = entering_light(
-                lights, i, towards[lit], square[lit], cosine[lit], self.surface.eta
+            place = points_on_discs(lights, np.full(len(points), i), rng)
+            light = received_light(
+                lights, i, place, points, normals, self.scene, self.surface.eta
             )
-            received[lit] += light[:, None] * lights.intensity[i]
+            received += light[:, None] * lights.intensity[i]
         return received
 
     def _received_from_environment(

@@ -61,18 +61,33 @@ def transmitted_irradiance(
     normals = surface.normals[vertices]
     out = np.zeros((len(surface.vertices), len(lights)), np.float32)
     for i in range(len(lights)):
-        towards = lights.position[i] - points
-        square = np.einsum("nc,nc->n", towards, towards)
-        cosine = np.einsum("nc,nc->n", towards, normals) / np.sqrt(square)
-        front = np.flatnonzero(cosine > 0)
-        lit = front[
-            ~scene.occluded(
-                points[front], lights.position[i : i + 1], normal=normals[front]
-            )
-        ]
-        out[vertices[lit], i] = entering_light(
-            lights, i, towards[lit], square[lit], cosine[lit], surface.eta
+        place = np.broadcast_to(lights.position[i], points.shape)
+        out[vertices, i] = received_light(
+            lights, i, place, points, normals, scene, surface.eta
         )
+    return out
+
+
+def received_light(
+    lights: Lights,
+    i: int,
+    place: Array,
+    points: Array,
+    normals: Array,
+    scene: RayScene,
+    eta: float,
+) -> Array:
+    """Irradiance (n,) under the boundary per radiant intensity of light i [mm-2] at points
+    (n, 3), each lit from a place (n, 3) of the light; 0 in shadows and behind.
+    """
+    towards = place - points
+    square = np.einsum("nc,nc->n", towards, towards)
+    cosine = np.einsum("nc,nc->n", towards, normals) / np.sqrt(square)
+    front = np.flatnonzero(cosine > 0)
+    hidden = scene.occluded(points[front], place[front], normal=normals[front])
+    lit = front[~hidden]
+    out = np.zeros(len(points))
+    out[lit] = entering_light(lights, i, towards[lit], square[lit], cosine[lit], eta)
     return out
 
 

@@ -318,16 +318,14 @@ def withdraw(
         repeated = skindb.workflow.repeat_requests(db, dictionary=dictionary)
     if faults:
         raise InputError(faults)
-    return Withdrawal(
-        subject,
-        plan.versions,
-        plan.users,
-        dict(sorted((Counter(plan.removed) | erasure.removed).items())),
-        tuple(repeated),
-        tuple(erasure.revised),
-        tuple(erasure.lost),
-        erased,
-        datetime.now(UTC).isoformat(timespec="seconds"),
+    return replace(
+        plan,
+        removed=dict(sorted((Counter(plan.removed) | erasure.removed).items())),
+        repeated=tuple(repeated),
+        revised=tuple(erasure.revised),
+        lost=tuple(erasure.lost),
+        backups=erased,
+        date=datetime.now(UTC).isoformat(timespec="seconds"),
     )
 
 

@@ -97,7 +97,6 @@ def summarise(
     code = summary_digest()
     tables = CohortRequest("tables", digest=code)
     sample = CohortRequest("surfels", surfels=surfels, seed=seed, digest=code)
-    lookup = Lookup(db, release)
     chosen = None if maps is None else tuple(maps)
     map_request = CohortRequest("maps", size=size, digest=code, maps=chosen)
     lookup = Lookup(db, release)

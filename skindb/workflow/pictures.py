@@ -346,11 +346,9 @@ def view_takes(
     takes: Sequence[str],
     out: Path,
     *,
-    traits: Mapping[str, float] = NO_TRAITS,
-    study: str | None = None,
-    dictionary: Path | None = None,
     environment: Path | None = None,
     progress: Progress | None = None,
+    **options: Any,
 ) -> dict[str, Any]:
     """Write the page of a take to the file `out`, or of several into the folder `out`.
 
@@ -360,13 +358,13 @@ def view_takes(
         Database with models of the takes.
     out
         A file that ends in .html, or a folder.
-    traits, study, dictionary
-        Trait -> amount at the end of its slider (as in `skindb.workflow.edit`), the
-        study of the traits, and the dictionary of the fits.
     environment
         Light from all directions, an OpenEXR file; default an overcast sky.
     progress
         Called with the stage, the number of finished takes and the total number of takes.
+    **options
+        traits, study, dictionary: trait -> amount at the end of its slider (as in
+        `skindb.workflow.edit`), the study of the traits, and the dictionary of the fits.
 
     Returns
     -------
@@ -374,11 +372,6 @@ def view_takes(
         path, takes, and of a file its bytes.
     """
     named = OVERCAST if environment is None else environment.name
-    options: dict[str, Any] = {
-        "traits": traits,
-        "study": study,
-        "dictionary": dictionary,
-    }
     faces = _faces(db, takes, environment=environment, progress=progress, **options)
     description: dict[str, Any] = {"path": str(out), "takes": list(takes)}
     if out.suffix == ".html":
