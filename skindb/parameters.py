@@ -382,6 +382,7 @@ class PictureParameters(Limited):
         "auto",
         "Values of the pictures: srgb, linear, or a file with the response of the "
         "camera (dn,r,g,b); auto: 8 bits are sRGB, others are linear.",
+        metavar="[auto|srgb|linear|FILE]",
     )
     width_mm: float | None = option(
         None,

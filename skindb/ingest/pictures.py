@@ -290,6 +290,13 @@ class _Frames:
         if automatic or response == "srgb":
             return _srgb_table(count)
         file = Path(response)
+        require(
+            file.is_file(),
+            "response",
+            "must be auto, srgb, linear, or a file with the response of the camera",
+            f"no file {short(response)}",
+            "correct the word or the path",
+        )
         faults = list[Fault]()
         fields = Fields({"response": file.name}, str(file.parent), faults)
         read_response(file.parent, fields, (0, count - 1))

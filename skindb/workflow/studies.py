@@ -177,7 +177,7 @@ def _require_one_scale(db: Database, study: Study, inputs: Sequence[Record]) -> 
     low, high = (f(exposures, default=0.0) for f in (min, max))
     require(
         high <= EXPOSURE_RATIO * low,
-        ", ".join(exposures[x] for x in {low, high} & exposures.keys()),
+        ", ".join(exposures[x] for x in (low, high) if x in exposures),
         "takes without a white target are comparable if their pictures have one exposure",
         f"{low:.3g} and {high:.3g}, which the imports recorded",
         "name takes of one exposure with --take",

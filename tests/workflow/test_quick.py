@@ -105,6 +105,7 @@ def test_import_then_ingest_and_fit(pictures: Path, tmp_path: Path) -> None:
         (["--as", "images", "--consent", "all"], "must be from"),
         (["--as", "images", "--subject", "Jane Doe"], "letters, digits"),
         (["--as", "images", "--lights", "gone.csv"], "gone.csv"),
+        (["--as", "images", "--response", "sRGB"], "must be auto, srgb, linear"),
     ],
 )
 def test_wrong_imports_are_one_line(
