@@ -10,6 +10,7 @@ import re
 import shutil
 import struct
 import unicodedata
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -508,7 +509,10 @@ def _exif(path: Path) -> tuple[float, bool]:
     """
     base = ExifTags.Base
     try:
-        with Image.open(path, formats=("JPEG", "PNG", "TIFF")) as image:
+        with (
+            warnings.catch_warnings(action="ignore"),
+            Image.open(path, formats=("JPEG", "PNG", "TIFF")) as image,
+        ):
             tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
         exposure = (
             float(tags.get(base.ExposureTime, 0))

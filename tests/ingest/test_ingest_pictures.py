@@ -33,7 +33,7 @@ from skindb.ingest import (
     ingest_capture,
     read_capture,
 )
-from skindb.ingest.pictures import read_lights, read_picture
+from skindb.ingest.pictures import _exif, read_lights, read_picture
 
 PERSON = {"subject": "P1", "consent": {"scope": ["fit"], "reference": "form 1"}}
 LIGHTS = directions(9)
@@ -216,9 +216,11 @@ def test_jpeg_is_turned_as_it_is_looked_at(tmp_path: Path) -> None:
     assert picture[:8].min() > 180 > 20 > picture[12:].max()
 
 
-def write_photographs(folder: Path, seconds: Sequence[float]) -> list[str]:
+def write_photographs(
+    folder: Path, seconds: Sequence[float], lights: np.ndarray = LIGHTS
+) -> list[str]:
     """JPEG pictures whose EXIF states exposures."""
-    stems = write_pictures(folder, LIGHTS, dtype="uint8", srgb=True)
+    stems = write_pictures(folder, lights, dtype="uint8", srgb=True)
     for stem, time in zip(stems, seconds, strict=True):
         path = folder / stem
         exif = Image.Exif()
@@ -250,6 +252,18 @@ def test_exposures_of_pictures_are_compared_and_recorded(tmp_path: Path) -> None
     rows = [f"{row},{time}" for row, time in zip(rows[1:], times, strict=True)]
     table.write_text("\n".join(["picture,x,y,z,intensity", *rows]))
     import_images(table.parent, tmp_path / "again", PERSON)
+
+
+def test_damaged_exif_states_nothing(tmp_path: Path) -> None:
+    (name,) = write_photographs(tmp_path, [0.01], LIGHTS[:1])
+    path = tmp_path / name
+    whole = path.read_bytes()
+    assert _exif(path) == (pytest.approx(0.005), True)
+    begin = whole.index(b"Exif")
+    for place in range(begin + 6, begin + 60):
+        path.write_bytes(whole[:place] + b"\xff" + whole[place + 1 :])
+        exposure, _ = _exif(path)  # which neither fails nor warns
+        assert 0 <= exposure < np.inf
 
 
 def test_a_mask_and_grey_pictures(pictures: Path, tmp_path: Path) -> None:
