@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
@@ -358,7 +358,7 @@ def plot_albedo(
         lines = part[variables.ALBEDO_HISTOGRAM].isel(axis=axis).values
     ax.set_prop_cycle(color=plots.CYCLE)
     for i, (name, fractions) in enumerate(zip(names, lines, strict=True)):
-        style: dict[str, Any] = (
+        style = (
             {"label": name}
             if len(names) <= MAX_LEGEND_ENTRIES
             else {"color": "0.4", "linewidth": 0.5}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
@@ -226,7 +226,7 @@ def describe_correlations(table: xr.Dataset) -> list[str]:
 
 def plot_correlations(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot the correlations with their 95 % intervals, one row per pair."""
-    names: list[Any] = table["pair"].values.tolist()
+    names = table["pair"].values.tolist()
     ax = ax or plots.new_axes(6.5, 1.0 + 0.24 * len(names))
     ax.axvline(0, color="0.6", linewidth=1)
     correlations = table[variables.COMPONENT_CORRELATION].values

@@ -438,7 +438,7 @@ def _plot_table(
         and {part.partition(":")[0] for part in name} == {GENDER, ANCESTRY}
     ]
     if not bands:
-        keys: list[tuple[str, ...]] = [*((name,) for name in single), *pairs]
+        keys = [*((name,) for name in single), *pairs]
         return (
             [_cell_values(key) for key in keys],
             ["all"],

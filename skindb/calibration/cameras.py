@@ -39,7 +39,7 @@ from skindb.format.dome import (
     Pinhole,
 )
 from skindb.schema import GROUPS, dataset
-from skindb.types import Float32, Float64, Mask
+from skindb.types import Float32, Float64
 
 # the manufacturer's reference values, as in colour-science
 CHART = "ColorChecker24 - After November 2014"
@@ -124,7 +124,7 @@ def fit_colour_matrix(patches: ArrayLike) -> ColourFit:
         f"{values.shape} and {target.shape}",
         "give the patches row by row",
     )
-    good: Mask = np.asarray(np.isfinite(values).all(axis=1))
+    good = np.asarray(np.isfinite(values).all(axis=1))
     white = int(target.sum(axis=1).argmax())
     usable = good.sum() >= MIN_PATCHES and good[white] and values[white, 1] > 0
     require(

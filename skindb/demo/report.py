@@ -455,7 +455,7 @@ def _strips(results: Results) -> dict[str, str]:
 def write_report(path: Path, results: Results, *, progress: Progress) -> Path:
     """Write the report, which is viewed without a network, and return its path."""
     portraits = draw_portraits(results.models)
-    parts: tuple[tuple[str, Section], ...] = (
+    parts = (
         ("Subjects", subjects_section),
         ("Surfels without a fit", _statuses),
         ("Predicted photographs", _predicted),

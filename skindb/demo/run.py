@@ -123,7 +123,7 @@ def _make_takes(
 
 def _studies(parameters: DemoParameters) -> dict[str, dict[str, Any]]:
     """Names and parameters of the studies; traits need two takes."""
-    studies: dict[str, dict[str, Any]] = {
+    studies = {
         "brdf": {"seed": parameters.seed},
         "albedo": {},
         "translucency": {},

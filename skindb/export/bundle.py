@@ -442,9 +442,7 @@ def _write_bases(
         "basis_brdf (component, theta_h, theta_d, phi_d), its nodes [rad], "
         f"{mixed}skindb fit --dictionary reads it"
     )
-    described: dict[str, dict[str, Any]] = {
-        "bases/bases.npz": {"holds": text, "units": "sr-1"}
-    }
+    described = {"bases/bases.npz": {"holds": text, "units": "sr-1"}}
     for k in range(count if merl else 0):
         write_merl(folder / f"component_{k}.binary", merl_table(tables[..., k]))
         described[f"bases/component_{k}.binary"] = {

@@ -159,7 +159,7 @@ def _material(extras: dict[str, Any], skin: Skin) -> dict[str, Any]:
         "specularColorTexture": {"index": 3},
     }
     root = np.sqrt(skin.top_f0)
-    extensions: dict[str, Any] = {
+    extensions = {
         "KHR_materials_ior": {"ior": float((1 + root) / (1 - root))},
         "KHR_materials_specular": specular | {"specularColorFactor": [1.0, 1.0, 1.0]},
     }

@@ -92,7 +92,7 @@ def fit_material(
     amounts = np.stack(
         [np.concatenate([diffuse[:, [c]], weights], axis=1) for c in range(3)]
     ).astype(float)
-    base: Array = np.asarray(diffuse, float)
+    base = np.asarray(diffuse, float)
     low: Array
     high: Array
     roughness: Array

@@ -217,7 +217,7 @@ def read_frame(
         content = read_regular(path, MAX_FRAME_BYTES)
         # checks the size before memory for it is allocated
         _header(path, io.BytesIO(content))
-        frame: Frame = decode(path, content)
+        frame = decode(path, content)
     shape = frame.shape[:2] if kind is None else (kind.height, kind.width)
     dtype = frame.dtype if kind is None else kind.dtype
     same_type = frame.dtype in (dtype, np.float16 if dtype == np.float32 else dtype)

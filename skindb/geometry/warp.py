@@ -270,7 +270,7 @@ class _System:
 
 def _merged(source: Array, target: Array) -> tuple[Float64, Float64, Mask]:
     """Distinct points of both, and mask of the points that represent them."""
-    is_used: Mask = np.isfinite(np.hstack([source, target])).all(axis=1)
+    is_used = np.isfinite(np.hstack([source, target])).all(axis=1)
     finite = np.flatnonzero(is_used)
     group = np.arange(len(source))
     for points in (source, target):

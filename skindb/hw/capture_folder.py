@@ -152,7 +152,7 @@ def open_unfinished(folder: Path, identity: Mapping[str, Any]) -> Unfinished:
 
 
 def _read(folder: Path, path: Path, note: Any) -> Unfinished:
-    record: dict[str, Any] = note if isinstance(note, dict) else {}
+    record = note if isinstance(note, dict) else {}
     identity = record.get("identity")
     override = record.get("override")
     sequence = _entries(record.get("sequence"), STEP_KEYS)
@@ -542,7 +542,7 @@ def write_capture(
         "mesh", and optionally "landmarks" and "regions" -> file.
     """
     out = session.folder
-    record: dict[str, Any] = capture_record(subject)
+    record = capture_record(subject)
     record["dome"] = "dome/dome.json"
     if session.override:
         record["override"] = session.override

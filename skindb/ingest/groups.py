@@ -37,7 +37,7 @@ def surfel_group(
     """Group "surfels", with the error of the scan's normals [degree]; without a dome it
     has no visibility.
     """
-    variables: dict[str, Any] = {
+    variables = {
         "surfel_position": surfels.position,
         "surfel_normal": surfels.normal,
         "surfel_area": surfels.area,
@@ -95,7 +95,7 @@ def dome_group(dome: DomeRecord, intensity: Float64) -> xr.Dataset:
     """Group "dome"."""
     cameras = dome.cameras
     lights = dome.lights
-    variables: dict[str, Any] = {
+    variables = {
         "light_position": [light.position for light in lights],
         "light_axis": [light.axis for light in lights],
         "light_disc_radius": [light.disc_radius for light in lights],

@@ -106,7 +106,7 @@ def estimate_relief(
     for _ in range(rounds):
         points = camera.centre + depth[..., None] * rays
         normal = photometric_normals(values, lit, dome.lights, points, -rays)
-        known: Mask = np.asarray(np.isfinite(normal).all(axis=-1))
+        known = np.asarray(np.isfinite(normal).all(axis=-1))
         require(
             bool(known.any()),
             f"{dome.file}[frames]",

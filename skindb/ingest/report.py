@@ -225,9 +225,7 @@ def calibration_table(calibration: xr.Dataset) -> list[list[Any]]:
     """Header and rows: offset [mm] and scale [%] of each camera, agreement and
     brightness of cameras and lights.
     """
-    rows: list[list[Any]] = [
-        ["device", "offset [mm]", "larger by [%]", "agreement", "brightness"]
-    ]
+    rows = [["device", "offset [mm]", "larger by [%]", "agreement", "brightness"]]
     for name in calibration["camera"].values:
         camera = calibration.sel(camera=name)
         brightness = camera["camera_brightness"].values

@@ -91,7 +91,7 @@ def lookup(
     fy = (y - j)[..., None]
     fz = (z - k)[..., None]
     k, k1 = k % n_phi, (k + 1) % n_phi
-    total: Array = np.zeros((*x.shape, table.shape[3]))
+    total = np.zeros((*x.shape, table.shape[3]))
     for di, wx in ((0, 1 - fx), (1, fx)):
         for dj, wy in ((0, 1 - fy), (1, fy)):
             total += (

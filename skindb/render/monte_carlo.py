@@ -450,7 +450,7 @@ class LightChoice:
         )
         power[:, :] += power.sum() == 0  # lights that are all off
         probability = power / power.sum(axis=1, keepdims=True)
-        rising: Array = np.cumsum(probability, axis=1)
+        rising = np.cumsum(probability, axis=1)
         rising /= rising[:, -1:]
         return cls(
             lights,

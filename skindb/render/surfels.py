@@ -79,7 +79,7 @@ def surfel_texels(fitted: xr.Dataset) -> Codes:
 
 def surfel_confidence(fitted: xr.Dataset) -> Float32:
     """(n,) 1 for fitted surfels, 0.5 for doubtful fits, 0 for all others."""
-    trust: Float32 = TRUST[surfel_texels(fitted)]
+    trust = TRUST[surfel_texels(fitted)]
     if not trust.any():
         raise input_error(
             "fitted[fit_status]",

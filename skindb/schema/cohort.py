@@ -139,7 +139,7 @@ def take_coords(
     fit
         Attributes of its model, if there is one.
     """
-    coords: dict[str, Any] = {
+    coords = {
         "subject": str(attrs.get("subject", take)),
         "condition": str(attrs.get("condition", "normal")),
         "session": attrs.get("session"),

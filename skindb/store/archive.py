@@ -265,7 +265,7 @@ class Archive:
         """The records of a state by their keys, ascending; faults of others are added
         to `faults`.
         """
-        items: list[Item] = [
+        items = [
             (key, digest, None)
             for key, digest in sorted(state.files.items())
             if key.startswith("log/")
@@ -276,7 +276,7 @@ class Archive:
 
     def requests(self, state: State, faults: list[Fault]) -> list[Request]:
         """The requests of a state; faults of others are added to `faults`."""
-        items: list[Item] = [
+        items = [
             (key, digest, None)
             for key, digest in state.files.items()
             if key.startswith(f"{REQUESTS}/")
@@ -285,7 +285,7 @@ class Archive:
 
     def version_items(self, record: Record) -> list[Item]:
         """All files of a version except for its record; `InputError` if its manifest is damaged."""
-        beside: Item = (record.beside("manifest"), record.manifest, None)
+        beside = (record.beside("manifest"), record.manifest, None)
         return [beside, *items_of(record, self._parsed(beside, manifest_from_json))]
 
     def uses(self, state: State, seen: set[str], faults: list[Fault]) -> list[Item]:
@@ -376,7 +376,7 @@ def content_key(digest: str) -> str:
 
 def items_of(record: Record, manifest: Manifest) -> list[Item]:
     """The files of a version that its manifest lists, and its tables."""
-    items: list[Item] = [
+    items = [
         (f"{record.path}/{name}", file.digests.whole, file.size)
         for name, file in manifest.items()
     ]

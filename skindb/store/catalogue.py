@@ -165,7 +165,7 @@ def _describe(lookup: Lookup, stale: Staleness, kind: str, take: str) -> dict[st
         reasons = stale.reasons(record) if kind in DERIVED else ()
     except InputError as error:
         return {"fault": str(error)}
-    summary: dict[str, Any] = {
+    summary = {
         "generation": record.generation,
         "path": lookup.place.url(record.path),
         "created": record.created,

@@ -337,7 +337,7 @@ def _old_generations(place: Place, generations: int, now: Clock) -> Iterator[Gar
             raise InputError(faults)
         listed |= {record.key: record for record in records}
         waiting += records if log.kind in KEPT_KINDS else records[-generations:]
-    stays: set[Key] = set()
+    stays = set()
     while waiting:
         record = waiting.pop()
         if record.key not in stays:

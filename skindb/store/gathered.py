@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -200,9 +199,7 @@ def _seals(url: str, key: str) -> frozenset[str]:
 
 def _packed(key: str, block: xr.Dataset) -> bytes:
     """Content of the file of a block."""
-    arrays: dict[str, Any] = {
-        str(name): v.values for name, v in block.variables.items()
-    }
+    arrays = {str(name): v.values for name, v in block.variables.items()}
     for name, values in arrays.items():
         if values.dtype.kind not in "fiub":
             arrays[name] = np.array(values.tolist(), "U")
@@ -223,9 +220,7 @@ def _stored(place: Place, key: str) -> xr.Dataset:
         raise ValueError("content that does not match its digest")
     with np.load(io.BytesIO(content[DIGEST_BYTES:]), allow_pickle=False) as arrays:
         values = {name: arrays[name] for name in arrays.files}
-    coords: dict[str, Any] = {
-        name: values.pop(name) for name in [*values] if name not in VARIABLES
-    }
+    coords = {name: values.pop(name) for name in [*values] if name not in VARIABLES}
     coords[SEAL] = (TAKE, coords[SEAL])
     dims = {name: (TAKE, *VARIABLES[name].dims) for name in values}
     return xr.Dataset({name: (dims[name], values[name]) for name in values}, coords)

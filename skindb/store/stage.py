@@ -510,7 +510,7 @@ def _encoding(array: xr.DataArray) -> dict[str, Any]:
     length, *rest = array.shape
     rows = _object_rows(array)
     # no fill value, which a reader would mask; missing values are NaN or have a status
-    plain: dict[str, Any] = {"compressors": [CODEC], "_FillValue": None}
+    plain = {"compressors": [CODEC], "_FillValue": None}
     if array.dims[0] != "surfel":
         return plain | {"chunks": (min(rows, length), *rest)}
     # reading a chunk takes at least a millisecond, whatever its size

@@ -74,7 +74,7 @@ def database_faults(place: Place) -> list[Fault]:
     faults: list[Fault] = []
     records: list[Record] = []
     tombstone_names = tombstones(place)
-    damaged: set[str] = set()  # logs with a missing or unreadable record
+    damaged = set()  # logs with a missing or unreadable record
     for log in committed_logs(place):
         try:
             readable, broken = log.faults()

@@ -317,7 +317,7 @@ def _save(task: LandmarkTask, request: dict[str, Any]) -> dict[str, Any]:
     confirmed, and describe the result.
     """
     points = parsed_points(request.get("points"), "points")
-    crop: Crop | None = (
+    crop = (
         None
         if request.get("crop") is None
         else parsed_crop(request["crop"], "crop box")

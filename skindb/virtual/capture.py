@@ -85,7 +85,7 @@ def capture_record(person: Person, *, contact: bool, landmarks: bool) -> dict[st
         "beard_density": person.beard_density,
         "freckles": person.freckles,
     }
-    record: dict[str, Any] = {
+    record = {
         "format": "skindb-capture",
         "version": 1,
         "subject": person.subject,

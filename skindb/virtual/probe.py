@@ -80,10 +80,8 @@ def fibre_profiles(walk: Walk, sites: Sequence[Site]) -> ProbeTruth:
     """Diffuse reflectance R(r) averaged over the faces of the source and of each fibre,
     for every site and channel.
     """
-    distance: Float64 = FIRST + PITCH * np.arange(FIBRES, dtype=float)
-    edges: Float64 = BIN * np.arange(
-        round((distance[-1] + 1.0) / BIN) + 1, dtype=np.float64
-    )
+    distance = FIRST + PITCH * np.arange(FIBRES, dtype=float)
+    edges = BIN * np.arange(round((distance[-1] + 1.0) / BIN) + 1, dtype=np.float64)
     middle = (edges[:-1] + edges[1:]) / 2
     face = _disc_shares(middle, distance) @ _disc_shares(middle, middle)
     profile = np.empty((len(sites), FIBRES, 3))

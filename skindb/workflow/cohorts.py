@@ -101,7 +101,7 @@ def summarise(
     map_request = CohortRequest("maps", size=size, digest=code, maps=chosen)
     lookup = Lookup(db, release)
     registered = [take for take in names if lookup.has("registration", take)]
-    steps: list[tuple[str, list[str], list[CohortRequest], Callable[..., Record]]] = [
+    steps = [
         ("model", names, [tables, sample], partial(_summarise_model, db, sample)),
         (
             "registration",

@@ -121,7 +121,7 @@ def _tables(root: Path, module: str, statement: ast.stmt) -> Iterator[Path]:
 def _reached(root: Path, starts: Iterable[Symbol]) -> set[Symbol]:
     """The definitions that some definitions use, and these themselves."""
     symbols: set[Symbol] = set()
-    references: set[Reference] = set()
+    references = set()
     pending: list[Reference] = [(module, (name,)) for module, name in starts]
     while pending:
         reference = pending.pop()

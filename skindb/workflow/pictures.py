@@ -373,7 +373,7 @@ def view_takes(
     """
     named = OVERCAST if environment is None else environment.name
     faces = _faces(db, takes, environment=environment, progress=progress, **options)
-    description: dict[str, Any] = {"path": str(out), "takes": list(takes)}
+    description = {"path": str(out), "takes": list(takes)}
     if out.suffix == ".html":
         [(record, still)] = faces
         return description | {

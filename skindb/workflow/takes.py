@@ -491,7 +491,7 @@ class Cluster:
         call = cloudpickle.dumps(partial(pickled_outcome, function))
         with shared_token(self.shared) as token:
             expected = Expected(__version__, package_digest(), token)
-            message: Any = bytes(cloudpickle.dumps((expected, call)))
+            message = bytes(cloudpickle.dumps((expected, call)))
             # its own task: the graph holds it once
             if len(message) > MAX_REPEATED_BYTES:
                 message = client.submit(bytes, message, pure=False)

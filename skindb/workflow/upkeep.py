@@ -73,7 +73,7 @@ def refresh(
         that would read it.
     """
     resources = {"workers": workers, "client": client}
-    makers: dict[str, Callable[[list[Refreshed]], list[Refreshed]]] = {
+    makers = {
         "model": partial(_fit_again, db, dictionary, wait, resources),
         "registration": partial(_register_again, db, resources),
         STUDY: partial(_repeat_again, db, dictionary),
@@ -117,7 +117,7 @@ def repeat_requests(
         One for each request, in order of dependence. What fails for any reason is named
         there, and stays requested.
     """
-    makers: dict[str, Callable[[Request], Record]] = {
+    makers = {
         "registration": lambda request: _repeat_registration(db, request),
         STUDY: lambda request: repeat_study(
             db, request.take, request.parameters, dictionary=dictionary
