@@ -41,7 +41,7 @@ from skindb.numerics.inference import (
 from skindb.numerics.statistics import known_mean
 from skindb.parameters import ContrastParameters
 from skindb.schema import IDENTIFIED, variables
-from skindb.types import Array, Index, Mask
+from skindb.types import Array, Index, Mask, float64
 
 Result = TypeVar("Result")
 CHANNELS = ("R", "G", "B")
@@ -166,7 +166,7 @@ def _table_values(
     tables: xr.Dataset, variable: str, dims: tuple[str, ...], *, logarithmic: bool
 ) -> Array:
     """Values (take, q) of a variable, or the logarithms of identified ones."""
-    values = np.asarray(tables[variable].transpose("take", *dims).values, float)
+    values = float64(tables[variable].transpose("take", *dims).values)
     if logarithmic:
         identified = tables[variables.SITE_STATUS].isin(IDENTIFIED)
         good = identified.transpose("take", *dims).values & (values > 0)

@@ -18,7 +18,7 @@ from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, store
 from skindb.schema import GROUPS, Use, check, dataset, label, names_of, variables
 from skindb.schema.consent import honour_consent
 from skindb.schema.label import FACE, take_attrs
-from skindb.types import Array, Mask
+from skindb.types import Array, Mask, float64
 
 Report = dict[str, Any]
 # limits of an edited albedo
@@ -245,9 +245,7 @@ def with_basis(
     weights = fitted[variables.DICTIONARY_WEIGHT].values.astype(float)
     good = np.isfinite(weights).all(axis=1)
     coefficients = np.full((len(weights), len(mixture)), np.nan)
-    coefficients[good] = project(
-        weights[good], np.asarray(mixture, float), brdf_metric(tables)
-    )
+    coefficients[good] = project(weights[good], float64(mixture), brdf_metric(tables))
     rest = fitted.drop_dims("component")  # the components of another basis differ
     fitted = rest.assign(basis_weight=label(variables.BASIS_WEIGHT, coefficients))
     basis = xr.Dataset(

@@ -14,7 +14,7 @@ import xarray as xr
 from skindb.files import package_json
 from skindb.schema import variables
 from skindb.schema.label import FACE
-from skindb.types import Array, Mask
+from skindb.types import Array, Mask, float64
 
 Corner = tuple[str, float, float]
 
@@ -50,11 +50,7 @@ def region_masks(common_uv: Array, landmarks: Mapping[str, Array]) -> dict[str, 
         overlap; "beard" is where a beard may grow, without the lips; "no_beard" is the
         skin of forehead, nose and cheeks outside the beard.
     """
-    places = {
-        name: np.asarray(p, float)
-        for name, p in landmarks.items()
-        if np.isfinite(p).all()
-    }
+    places = {name: float64(p) for name, p in landmarks.items() if np.isfinite(p).all()}
     if {"lip_upper", "mouth_corner_right", "mouth_corner_left"} <= places.keys():
         corners = (places["mouth_corner_right"] + places["mouth_corner_left"]) / 2
         places["lip_lower"] = corners + LOWER_LIP * (corners - places["lip_upper"])

@@ -27,7 +27,7 @@ from skindb.geometry.warp import (
 from skindb.schema import dataset, variables
 from skindb.schema.consent import honour_consent
 from skindb.schema.notes import Note, note
-from skindb.types import Array, Float64, Index
+from skindb.types import Array, Float64, Index, float64
 
 Takes = Mapping[str, xr.DataTree]
 Registered = Mapping[str, xr.Dataset]
@@ -132,7 +132,7 @@ def outline(model: xr.DataTree, names: Sequence[str]) -> Outline:
     """Outline of a take, the input of `common_frame`."""
     sheet = _sheet(model, list(names))
     return Outline(
-        np.asarray(sheet.landmark, float),
+        float64(sheet.landmark),
         _landmark_uv(sheet),
         sheet.area(),
         sheet.alignable(),
@@ -274,9 +274,7 @@ def _landmark_uv(sheet: Sheet) -> Float64:
 
 
 def _landmarks_mm(model: xr.DataTree) -> Float64:
-    return np.asarray(
-        model["mesh"].to_dataset()[variables.LANDMARK_POSITION].values, np.float64
-    )
+    return float64(model["mesh"].to_dataset()[variables.LANDMARK_POSITION].values)
 
 
 def _mm_per_uv(landmark: Array, target: Array) -> float:
@@ -347,7 +345,7 @@ def corresponding_points(
         np.pad(registered[variables.COMMON_UV].values.astype(float), ((0, 0), (0, 1))),
         faces,
     )
-    start = np.pad(np.asarray(common, float), ((0, 0), (0, 1)), constant_values=HEIGHT)
+    start = np.pad(float64(common), ((0, 0), (0, 1)), constant_values=HEIGHT)
     face, corner, _ = flat.first_hit(start, np.array([[0.0, 0.0, -1.0]]))
     return np.where(
         (face >= 0)[:, None],

@@ -24,7 +24,7 @@ from skindb.numerics.statistics import Moments, variance_components
 from skindb.parameters import group_option
 from skindb.schema import IDENTIFIED, ProbeStatus, dataset, variables
 from skindb.schema.cohort import require_same_fit, require_takes
-from skindb.types import Array
+from skindb.types import Array, float64
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -178,7 +178,7 @@ def _trusted(takes: xr.Dataset) -> dict[str, Array]:
     node = takes[[name for name in names if name in takes]].load()
     good = node[variables.SITE_STATUS].isin(IDENTIFIED)
     return {
-        str(name): np.asarray(node[name].where(good).values, float)
+        str(name): float64(node[name].where(good).values)
         for name in node
         if name != names[-1]
     }

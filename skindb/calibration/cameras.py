@@ -39,7 +39,7 @@ from skindb.format.dome import (
     Pinhole,
 )
 from skindb.schema import GROUPS, dataset
-from skindb.types import Float32, Float64
+from skindb.types import Float32, Float64, float64
 
 # the manufacturer's reference values, as in colour-science
 CHART = "ColorChecker24 - After November 2014"
@@ -115,7 +115,7 @@ def fit_colour_matrix(patches: ArrayLike) -> ColourFit:
     InputError
         Wrong shapes, too few usable patches, an unusable white patch, or patches of one colour.
     """
-    values = np.asarray(patches, float)
+    values = float64(patches)
     target = chart_reference()
     require(
         values.shape == target.shape,
@@ -154,7 +154,7 @@ def _least_squares(camera: Float64, target: Float64) -> tuple[Float64, Float64]:
     residual = target - camera @ solution
     variance = (residual**2).sum(axis=0) / max(len(camera) - 3, 1)
     error = np.sqrt(variance[:, None] * np.diag(np.linalg.inv(camera.T @ camera)))
-    return np.asarray(solution, float), error
+    return float64(solution), error
 
 
 def _difference(measured: Float64, expected: Float64) -> Float64:
@@ -447,7 +447,7 @@ def reprojection_error(
     InputError
         No point remains.
     """
-    residual = np.asarray(pixels, float) - camera.project(points)
+    residual = float64(pixels) - camera.project(points)
     length = np.linalg.norm(residual, axis=-1)
     observed = length[np.isfinite(length)]
     require(

@@ -268,7 +268,7 @@ def find_fibres(picture: ArrayLike, *, count: int) -> Spots:
     InputError
         The picture is not finite, or another number of spots is found.
     """
-    grey = np.asarray(picture, float)
+    grey = float64(picture)
     require(
         grey.ndim == 2 and np.isfinite(grey).all(),
         "picture of the fibres",
@@ -361,7 +361,7 @@ def fibre_gain(signal: ArrayLike) -> FibreGain:
     InputError
         Too few frames, or signals that are not positive and finite.
     """
-    values = np.asarray(signal, float)
+    values = float64(signal)
     shaped = values.ndim == 3 and values.shape[2] == 3 and values.shape[1] > 1
     require(
         shaped

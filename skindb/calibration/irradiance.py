@@ -16,7 +16,7 @@ from skindb.errors import attempt_all, require
 from skindb.format.dome import CameraRecord, DomeRecord, LightRecord, WhiteRecord
 from skindb.format.frames import Digests
 from skindb.numerics.statistics import robust_deviation
-from skindb.types import Float64, Index, Mask
+from skindb.types import Float64, Index, Mask, float64
 
 # of the half size: a disc inside the square, however the square is rotated
 TARGET_INTERIOR_FRACTION = 0.8
@@ -82,7 +82,7 @@ def light_intensities(
         if light.intensity is not None:
             return light.intensity * light.gain
         if white is None:
-            middle = np.asarray(centre, np.float64)
+            middle = float64(centre)
             return relative_intensity(dome, middle) * light.gain
         values = [np.zeros((0, 3))]
         for target in targets:
@@ -203,7 +203,7 @@ def _intensities(
         "point, normal and half_size must be those of the target, and its frames "
         "must show it and not the face",
     )
-    return np.asarray(values, float)
+    return float64(values)
 
 
 def unevenness(values: Float64) -> float:
@@ -313,7 +313,7 @@ def fit_light(target: TargetPixels, *, falloff: float | None = None) -> LightFit
     InputError
         Wrong shapes, too few usable pixels, or more than half of them in shadow.
     """
-    radiance = np.asarray(target.radiance, float)
+    radiance = float64(target.radiance)
     require(
         radiance.shape == np.shape(target.points) == (len(radiance), 3),
         "white target",

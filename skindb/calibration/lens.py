@@ -10,7 +10,7 @@ from scipy import optimize, special
 
 from skindb.errors import require
 from skindb.numerics.statistics import robust_deviation
-from skindb.types import Float64, Mask
+from skindb.types import Float64, Mask, float64
 
 # px from the edge that are fitted; farther away the glare is no longer even
 EDGE_REACH_PX = 12.0
@@ -62,7 +62,7 @@ def fit_edge(picture: ArrayLike) -> EdgeFit:
     InputError
         The picture is too small, not finite, has no edge, or the edge is not slanted.
     """
-    grey = np.asarray(picture, float)
+    grey = float64(picture)
     require(
         grey.ndim == 2 and min(grey.shape) >= 16 and np.isfinite(grey).all(),
         "slanted edge",
@@ -208,8 +208,8 @@ def fit_vignette(flat: ArrayLike, centre: ArrayLike) -> Vignette:
         Too few pixels are finite and positive, or they do not reach far enough from the
         principal point.
     """
-    picture = np.asarray(flat, float)
-    middle = np.asarray(centre, float)
+    picture = float64(flat)
+    middle = float64(centre)
     require(
         picture.ndim == 2,
         "flat frame",
@@ -257,4 +257,4 @@ def _robust_fit(design: Float64, value: Float64) -> tuple[Float64, Float64, Mask
         spread = float(robust_deviation(residual[inliers]))
         limit = MAX_DEVIATIONS * max(spread, 1e-12 * abs(solution[0]))
         inliers = np.abs(residual) <= limit
-    return np.asarray(solution, float), residual, np.asarray(inliers)
+    return float64(solution), residual, np.asarray(inliers)

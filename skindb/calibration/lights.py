@@ -36,7 +36,7 @@ from skindb.format.dome import (
 from skindb.format.frames import CAMERA, LIGHT, filled, read_frame
 from skindb.parameters import POSITION_ERROR_MM
 from skindb.schema import dataset
-from skindb.types import Float64, Mask
+from skindb.types import Float64, Mask, float64
 
 # of the contrast over the ball; pixels above it belong to the highlight
 HIGHLIGHT_FRACTION = 0.5
@@ -118,7 +118,7 @@ def highlight_centre(picture: ArrayLike, outline: Outline) -> Float64:
     InputError
         The picture is not finite or even, or the bright spot is too large for a highlight.
     """
-    grey = np.asarray(picture, float)
+    grey = float64(picture)
     grey = grey.mean(axis=-1) if grey.ndim == 3 else grey
     row, column = np.mgrid[: grey.shape[0], : grey.shape[1]] + 0.5
     x, y = outline.centre
@@ -158,7 +158,7 @@ def distant_light(outline: Outline, highlight: ArrayLike) -> Float64:
     The view along -z is reflected at the normal of the ball under the highlight (2,)
     px: l = 2 (n . v) n - v.
     """
-    away = np.asarray(highlight, float) - outline.centre
+    away = float64(highlight) - outline.centre
     offset = away / outline.radius * [1, -1]
     square = float(offset @ offset)
     require(
@@ -193,8 +193,8 @@ def reflected_ray(
     InputError
         The line of sight misses the ball.
     """
-    view = camera.rays(np.asarray(highlight, float))
-    centre = np.asarray(ball, float)
+    view = camera.rays(float64(highlight))
+    centre = float64(ball)
     way = centre - camera.centre
     along = float(way @ view)
     square = float(way @ way)
@@ -238,12 +238,12 @@ def ball_centre(
     around = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     directions = list[Float64]()
     distances = list[float]()
-    for camera, circle in zip(cameras, np.asarray(outlines, float), strict=True):
+    for camera, circle in zip(cameras, float64(outlines), strict=True):
         sight = camera.rays(circle[:2] + circle[2] * around)
         # all lines make the same angle with the axis: sight . axis = cos(angle)
         axis = np.linalg.lstsq(sight, np.ones(OUTLINE_POINTS))[0]
         length = float(np.linalg.norm(axis))
-        directions.append(np.asarray(axis / length, float))
+        directions.append(float64(axis / length))
         distances.append(radius / np.sqrt(1 - min(1 / length**2, 1 - 1e-12)))
     start = np.array([camera.centre for camera in cameras])
     if len(cameras) == 1:
@@ -282,8 +282,8 @@ def light_position(origins: ArrayLike, directions: ArrayLike) -> LightPosition:
     InputError
         Fewer than two rays, values that are not finite, or rays that are nearly parallel.
     """
-    start = np.asarray(origins, float)
-    way = np.asarray(directions, float)
+    start = float64(origins)
+    way = float64(directions)
     shaped = start.ndim == 2 and start.shape == way.shape and len(start) >= 2
     require(
         shaped and np.isfinite([start, way]).all(),

@@ -23,7 +23,7 @@ from skindb.format.dome import CameraRecord, DomeRecord
 from skindb.format.frames import Digests, Frame, filled, read_frames
 from skindb.format.sensor import SensorRecord
 from skindb.jit import sample_bits
-from skindb.types import Bytes, Float32, Float64, Index, Mask
+from skindb.types import Bytes, Float32, Float64, Index, Mask, float64
 
 # number of radiances up to the white level at which the linear model is fitted to the
 # variance
@@ -357,7 +357,7 @@ def radiance_noise(
         Gain of the lens (vignette) at the face.
     """
     sensor = camera.sensor
-    time = np.asarray(seconds, float)
+    time = float64(seconds)
     per_value = np.asarray([1 / (sensor.white - sensor.black)], np.float32)
     read = float(read_sigma(per_value, sensor)[0]) ** 2
     # an exposure is the longest usable one where all longer ones are saturated

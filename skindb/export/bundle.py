@@ -36,7 +36,7 @@ from skindb.reflectance.tables import TableGrid, kernel_tables, lookup
 from skindb.render.image import write_exr
 from skindb.schema import VARIABLES, FitStatus, ProbeStatus, Use, names_of, variables
 from skindb.schema.consent import require_consent
-from skindb.types import Float32, Float64, Progress, silent
+from skindb.types import Float32, Float64, Progress, float64, silent
 
 WIDTH = 100
 MERL = "Renderers that read MERL binaries"
@@ -317,7 +317,7 @@ def merl_table(table: Float32) -> Float64:
     d = (np.arange(90) + 0.5) / 90 * np.pi / 2
     p = (np.arange(180) + 0.5) / 180 * np.pi
     values = lookup(table[..., None], *np.meshgrid(h, d, p, indexing="ij"))
-    return np.repeat(np.asarray(values, float), 3, axis=-1)
+    return np.repeat(float64(values), 3, axis=-1)
 
 
 def _write_parts(

@@ -20,7 +20,7 @@ from skindb.optics.diffusion import (
 )
 from skindb.render.surfels import with_matt_surfels
 from skindb.schema import check, variables
-from skindb.types import Array
+from skindb.types import Array, float64
 
 REQUIRED = (
     variables.SURFEL_POSITION,
@@ -171,7 +171,7 @@ def mean_free_path(diffuse: Array, sigma_tr: Array, *, eta: float) -> Array:
     """
     s, _ = dipole_s(diffuse, eta=eta)
     return np.asarray(
-        (MEAN_FREE_PATH_OFFSET + MEAN_FREE_PATH_PER_ALBEDO * np.asarray(diffuse, float))
+        (MEAN_FREE_PATH_OFFSET + MEAN_FREE_PATH_PER_ALBEDO * float64(diffuse))
         * s
         / sigma_tr
     )

@@ -20,7 +20,7 @@ from skindb.reflectance.tables import kernel_tables, lookup
 from skindb.render.image import encode_srgb
 from skindb.render.surfels import surfel_confidence
 from skindb.schema import variables
-from skindb.types import AnyArray, Array, Bytes, Float32, Float64, Index
+from skindb.types import AnyArray, Array, Bytes, Float32, Float64, Index, float64
 
 # values of perceptual roughness that are tried for each point
 ROUGHNESS = np.linspace(0.1, 1.0, 46)
@@ -92,7 +92,7 @@ def fit_material(
     amounts = np.stack(
         [np.concatenate([diffuse[:, [c]], weights], axis=1) for c in range(3)]
     ).astype(float)
-    base = np.asarray(diffuse, float)
+    base: Array = float64(diffuse)
     low: Array
     high: Array
     roughness: Array
@@ -488,9 +488,7 @@ def _through(fitted: xr.Dataset, shape: Shape, surfels: Index, eta: float) -> Fl
     deep = thickness(shape.position.astype(float), shape.normal, shape.triangles)[
         surfels
     ]
-    return np.asarray(
-        transmitted_fraction(deep, diffuse, sigma_tr, eta=eta), np.float64
-    )
+    return float64(transmitted_fraction(deep, diffuse, sigma_tr, eta=eta))
 
 
 def _columns(

@@ -34,7 +34,7 @@ from skindb.limits import (
     MAX_LIGHTS,
     MAX_SEQUENCE_STEPS,
 )
-from skindb.types import Float64, Index
+from skindb.types import Float64, Index, float64
 
 ROTATION_TOLERANCE = 1e-4  # of R R^T - 1: five digits in the file
 MAX_DISC_RADIUS_MM = 2_000.0  # mm: the largest soft boxes have a radius of 1 m
@@ -74,7 +74,7 @@ class Pinhole:
     @property
     def centre(self) -> Float64:
         """Centre of projection (3,) in mm."""
-        return np.asarray(camera_centre(self.R, self.t), float)
+        return float64(camera_centre(self.R, self.t))
 
     def project(self, points: ArrayLike) -> Float64:
         """Pixels (..., 2) of points (..., 3) in mm; NaN behind the camera."""

@@ -154,7 +154,7 @@ def _read_ply(stream: BinaryIO) -> tuple[Float64, Index]:
     _require_counts(stream)
     # fix_texture would split vertices along texture seams and so renumber them
     content = load_ply(stream, fix_texture=False, skip_materials=True)
-    vertices = np.asarray(content.get("vertices", np.zeros((0, 3))), np.float64)
+    vertices = float64(content.get("vertices", np.zeros((0, 3))))
     faces = np.asarray(content.get("faces", np.zeros((0, 3))), np.int64)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise DamageError(f"vertices of shape {vertices.shape}")

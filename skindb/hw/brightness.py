@@ -16,7 +16,7 @@ from skindb.hw.capture_folder import Setup
 from skindb.hw.dome import Dome
 from skindb.hw.sequence import DARK, Schedule, plan_schedule, slowed_schedule
 from skindb.hw.session import capture_dome, require_complete, with_dark_frames
-from skindb.types import Float64
+from skindb.types import Float64, float64
 
 THREADS = 2
 MIN_NEIGHBOURS = 3
@@ -290,7 +290,7 @@ def _ratio(dome: Mapping[str, Any], exposure: str, reference: str) -> float:
 
 
 def _unit(vector: Sequence[float] | Float64) -> Float64:
-    direction = np.asarray(vector, float)
+    direction = float64(vector)
     return np.asarray(direction / max(float(np.linalg.norm(direction)), 1e-12))
 
 

@@ -22,7 +22,7 @@ from skindb.ingest._sample_kernels import (
     shift_moments,
 )
 from skindb.numerics.statistics import correlation, robust_deviation
-from skindb.types import Array, Float32, Float64, Mask
+from skindb.types import Array, Float32, Float64, Mask, float64
 
 PIXEL_MM = 2.0  # mm; about the width of an eyelid, well below the offsets to be found
 SMOOTHING_PX = 0.7  # px of the downsampled picture; makes its derivatives smooth
@@ -249,7 +249,7 @@ def nan_quantile(values: Float64, level: float) -> Float64:
 
 def square_root_image(image: Array) -> Float64:
     """Square roots of a picture, slightly smoothed so that its derivatives are smooth."""
-    smooth = gaussian_filter(np.asarray(image, np.float64), SMOOTHING_PX)
+    smooth = gaussian_filter(float64(image), SMOOTHING_PX)
     return np.asarray(np.sqrt(np.maximum(smooth, 0)))
 
 
@@ -316,7 +316,7 @@ def view_factors(
     """
     grey = irradiance.mean(axis=1)
     surfels = view.clear & (grey > LIT_FRACTION * grey.max())
-    radiance = interpolated(np.asarray(picture, np.float64), pixels[surfels])
+    radiance = interpolated(float64(picture), pixels[surfels])
     return np.asarray(
         np.pi
         * np.median(radiance / (irradiance[surfels] * albedo[surfels, None]), axis=0)

@@ -18,7 +18,7 @@ from skindb.errors import Fault, InputError, attempt, input_error, require
 from skindb.format.contact_probe import ProbeRecord
 from skindb.format.fields import MAX_MAGNITUDE
 from skindb.format.frames import Digests
-from skindb.types import Float64, Index, Mask
+from skindb.types import Float64, Index, Mask, float64
 
 # the mean and two harmonics have five unknowns; one degree of freedom remains
 MIN_AZIMUTHS = 6
@@ -102,7 +102,7 @@ def compare_azimuths(
         clear of noise.
     """
     profile, sigma, r, phi = (
-        np.asarray(values, np.float64) for values in (value, error, distance, azimuth)
+        float64(values) for values in (value, error, distance, azimuth)
     )
     shape = (len(phi), len(r), 3)
     require(
@@ -241,8 +241,8 @@ def placement_variance(value: ArrayLike, error: ArrayLike) -> Repeatability:
     InputError
         Wrong shapes, fewer than three placements, or fewer than two fibres with a clear signal.
     """
-    profile = np.asarray(value, np.float64)
-    sigma = np.asarray(error, np.float64)
+    profile = float64(value)
+    sigma = float64(error)
     shaped = profile.ndim == 3 and profile.shape[2] == 3
     require(
         shaped and profile.shape == sigma.shape and len(profile) >= MIN_PLACEMENTS,
@@ -307,8 +307,8 @@ def level_trend(levels: ArrayLike, covariate: ArrayLike) -> Trend:
         Wrong shapes, values that are not finite, fewer than three placements, or a
         covariate that does not vary.
     """
-    y = np.asarray(levels, np.float64)
-    x = np.asarray(covariate, np.float64)
+    y = float64(levels)
+    x = float64(covariate)
     shaped = x.ndim == 1 and y.shape == (len(x), 3) and len(x) >= MIN_PLACEMENTS
     require(
         shaped and np.isfinite(y).all() and np.isfinite(x).all() and np.ptp(x) > 0,

@@ -30,7 +30,7 @@ from skindb.geometry.mesh import (
     vertex_normals,
 )
 from skindb.geometry.rays import RayScene
-from skindb.types import Float32, Float64, Index, Mask
+from skindb.types import Float32, Float64, Index, Mask, float64
 
 MAX_SURFELS = 2_500_000  # the samples of this many surfels in a full dome take 36 GB
 # mm; a landmark that is farther from the cropped than from the complete scan by this
@@ -211,7 +211,7 @@ def _site_position(
 ) -> Float64:
     for name in (SITE_LANDMARK.get(site, site), site):
         if name in landmarks:
-            return np.asarray(landmarks[name], np.float64)
+            return float64(landmarks[name])
     if site not in surfels.region_names:
         return np.full(3, np.nan)
     member = surfels.region[:, surfels.region_names.index(site)]

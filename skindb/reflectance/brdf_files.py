@@ -30,7 +30,7 @@ from skindb.reflectance.tables import (
     directional_albedo,
     lookup,
 )
-from skindb.types import AnyArray, Array, Index
+from skindb.types import AnyArray, Array, Index, float64
 
 TABLE = "basis_brdf"
 NODES = ANGLES
@@ -404,7 +404,7 @@ def read_merl(path: str | Path) -> tuple[Array, int]:
 
 def write_merl(path: str | Path, table: Array) -> None:
     """Write a table (90, 90, 180, 3) in sr^-1, whose values must be finite and non-negative."""
-    table = np.asarray(table, np.float64)
+    table = float64(table)
     wrong = int((~(np.isfinite(table) & (table >= 0))).sum())
     if table.shape != (*SHAPE, 3) or wrong:
         content = f"the shape {table.shape} and {wrong} other values"

@@ -55,7 +55,7 @@ from skindb.reflectance.sampling import (
 from skindb.reflectance.tables import Table, tabulate
 from skindb.schema import FitStatus, check, dataset, variables
 from skindb.schema.notes import Omission
-from skindb.types import Array, Float32
+from skindb.types import Array, Float32, float64
 
 ALBEDO_NODES = 24  # roughnesses at which the reflectance of a lobe is integrated
 # tables that stand for all lobes of a take, between which weights are interpolated; with a
@@ -241,7 +241,7 @@ class GGX:
         """Tables of lobes at `TABLES` roughnesses, and weights (n, TABLES) that interpolate
         between them; a roughness beyond the outermost takes that one.
         """
-        strength = np.asarray(parameters[:, STRENGTH], np.float64)
+        strength = float64(parameters[:, STRENGTH])
         roughness = np.clip(parameters[:, ROUGHNESS], MIN_ROUGHNESS, MAX_ROUGHNESS)
         shiny = np.isfinite(roughness) & (strength > 0)
         ends = np.array([MIN_ROUGHNESS, MAX_ROUGHNESS])

@@ -37,7 +37,7 @@ from skindb.reflectance.tables import (
     stored_brdf,
 )
 from skindb.schema import FitStatus, check, dataset
-from skindb.types import AnyArray, Array, Index, Mask
+from skindb.types import AnyArray, Array, Index, Mask, float64
 
 FRANK_WOLFE_STEPS = 200  # each step gives a valid bound; 500 steps lower it by 1 %
 MIN_COSINE_SAMPLES = 0.1  # cosine to light and camera above which fits use samples
@@ -397,7 +397,7 @@ class Systems:
             gram[s] = target.shape[1] * (block.T @ block)
             rhs[s] = block.T @ target[start:stop].sum(axis=1)
         surfel = np.repeat(np.arange(n), np.diff(offsets))
-        square = np.asarray(np.bincount(surfel, (target**2).sum(axis=1), n), np.float64)
+        square = float64(np.bincount(surfel, (target**2).sum(axis=1), n))
         return cls(
             gram, rhs, square, np.diff(offsets).astype(np.float64) * target.shape[1]
         )

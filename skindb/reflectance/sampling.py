@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from skindb.reflectance.tables import directional_albedo
-from skindb.types import Array, Float32, Mask
+from skindb.types import Array, Float32, Mask, float64
 
 # fraction of directions drawn by the cosine alone, as tables have tails that do not
 # depend on the half vector
@@ -61,7 +61,7 @@ class TableSampler:
         """
         if weights.shape[1] == 0:  # without the surface term
             weights = np.zeros((len(weights), len(self.albedo)))
-        lobes = np.maximum(np.asarray(weights, np.float64), 0.0) * self.albedo
+        lobes = np.maximum(float64(weights), 0.0) * self.albedo
         total = lobes.sum(axis=1, keepdims=True)
         shared = np.where(
             total > 0,

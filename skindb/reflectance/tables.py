@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from skindb.jit import LANES
 from skindb.optics.angles import directions, half_difference
-from skindb.types import AnyArray, Array, Float32, Float64
+from skindb.types import AnyArray, Array, Float32, Float64, float64
 
 Table = Float32
 ANGLES = ("theta_h", "theta_d", "phi_d")
@@ -80,9 +80,9 @@ def lookup(
     """
     nh, nd, n_phi = table.shape[:3]
     half = np.pi / 2
-    x = np.sqrt(np.clip(np.asarray(theta_h, np.float64) / half, 0, 1)) * (nh - 1)
-    y = np.clip(np.asarray(theta_d, np.float64) / half, 0, 1) * (nd - 1)
-    z = np.mod(np.asarray(phi_d, np.float64) / np.pi, 1.0) * n_phi
+    x = np.sqrt(np.clip(float64(theta_h) / half, 0, 1)) * (nh - 1)
+    y = np.clip(float64(theta_d) / half, 0, 1) * (nd - 1)
+    z = np.mod(float64(phi_d) / np.pi, 1.0) * n_phi
     x, y, z = np.broadcast_arrays(x, y, z)
     i = np.minimum(x.astype(int), nh - 2)
     j = np.minimum(y.astype(int), nd - 2)
@@ -145,7 +145,7 @@ def directional_albedo(table: AnyArray, cos_o: ArrayLike) -> Array:
     a, b = np.meshgrid(theta, phi, indexing="ij")
     h = np.stack([np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), np.cos(a)], axis=-1)
     rows = []
-    for c in np.atleast_1d(np.asarray(cos_o, np.float64)):
+    for c in np.atleast_1d(float64(cos_o)):
         wo = np.broadcast_to([np.sqrt(max(0.0, 1 - c * c)), 0.0, c], h.shape)
         cos_d = (wo * h).sum(-1)
         wi = 2 * cos_d[..., None] * h - wo

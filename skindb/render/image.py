@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from skindb.errors import Fault, InputError, input_error
 from skindb.files import private_file
-from skindb.types import AnyArray, Bytes, Float32, Float64, Mask
+from skindb.types import AnyArray, Bytes, Float32, Float64, Mask, float64
 
 Image = Float32
 DAMAGED = "a file that is cut off, damaged or of another format"
@@ -21,7 +21,7 @@ WHITE_QUANTILE = 0.995  # fraction of the lit pixels that a display image does n
 
 def encode_srgb(linear: ArrayLike) -> Float64:
     """Encode linear values as sRGB display values, clipped to [0, 1] (IEC 61966-2-1)."""
-    x = np.clip(np.asarray(linear, np.float64), 0, 1)
+    x = np.clip(float64(linear), 0, 1)
     return np.where(
         x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-12) ** (1 / 2.4) - 0.055
     )
@@ -29,7 +29,7 @@ def encode_srgb(linear: ArrayLike) -> Float64:
 
 def decode_srgb(display: ArrayLike) -> Float64:
     """Decode sRGB display values in [0, 1] to linear values (IEC 61966-2-1)."""
-    y = np.asarray(display, np.float64)
+    y = float64(display)
     return np.where(y <= 0.04045, y / 12.92, ((y + 0.055) / 1.055) ** 2.4)
 
 
@@ -50,7 +50,7 @@ def auto_exposure(radiance: ArrayLike, *, mask: Mask | None = None) -> float:
     float
         The factor, or 1 if no pixel is lit.
     """
-    peak = np.asarray(radiance, np.float64).max(axis=-1)
+    peak = float64(radiance).max(axis=-1)
     chosen = np.isfinite(peak) & (peak > 0)
     values = peak[chosen & mask] if mask is not None else peak[chosen]
     return float(1 / np.quantile(values, WHITE_QUANTILE)) if values.size else 1.0
@@ -68,9 +68,7 @@ def tone_map(radiance: ArrayLike, *, exposure: float | None = None) -> Bytes:
     exposure
         Factor before encoding; default `auto_exposure`.
     """
-    values = np.nan_to_num(
-        np.asarray(radiance, np.float64), nan=0.0, posinf=np.inf, neginf=0.0
-    )
+    values = np.nan_to_num(float64(radiance), nan=0.0, posinf=np.inf, neginf=0.0)
     gain = auto_exposure(radiance) if exposure is None else exposure
     with np.errstate(over="ignore"):
         return np.round(encode_srgb(values * gain) * 255).astype(np.uint8)

@@ -26,7 +26,7 @@ from skindb.render.shading import (
     trace_view,
     transmitted_irradiance,
 )
-from skindb.types import Array, Float32, Index, Mask, Progress
+from skindb.types import Array, Float32, Index, Mask, Progress, float64
 
 Image = Float32
 # rays per pixel and axis in one batch; random numbers are stratified over the rays of a
@@ -410,9 +410,9 @@ class _Hits:
         """
         points = Points(*(values[rows] for values in self.points))
         lit = np.ones((len(rows), 1), np.float32)
-        light = Lamp(lamp[:, None], lit, np.asarray(axis, np.float64), float(falloff))
+        light = Lamp(lamp[:, None], lit, float64(axis), float(falloff))
         shaded = self.surface.model.shade(points, light, eta=self.surface.eta)
-        return np.asarray(shaded * np.asarray(weight, np.float64)[:, None])
+        return np.asarray(shaded * float64(weight)[:, None])
 
 
 @dataclass(frozen=True)
@@ -507,7 +507,7 @@ def _shuffled(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.in
 
 def points_on_discs(lights: Lights, chosen: Index, rng: np.random.Generator) -> Array:
     """Points (n, 3) drawn uniformly on the discs of the chosen lights (n,)."""
-    tangent, second = tangents(np.asarray(lights.axis, np.float64))
+    tangent, second = tangents(float64(lights.axis))
     radius = lights.disc_radius[chosen] * np.sqrt(rng.random(len(chosen)))
     turn = 2 * np.pi * rng.random(len(chosen))
     across = (

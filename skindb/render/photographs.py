@@ -30,7 +30,7 @@ from skindb.render.shading import (
 from skindb.render.surfels import surfel_confidence
 from skindb.schema import check, variables
 from skindb.schema.consent import honour_consent
-from skindb.types import Array, Bytes, Float32, Float64, Mask
+from skindb.types import Array, Bytes, Float32, Float64, Mask, float64
 
 # pixels, the default of Wang et al. 2004's uniform window in scikit-image
 SSIM_WINDOW = 7
@@ -115,16 +115,16 @@ def delta_e(colours: ArrayLike, references: ArrayLike) -> Float:
 
     lab = []
     for values in (colours, references):
-        xyz = colour.RGB_to_XYZ(np.clip(np.asarray(values, np.float64), 0, 1), "sRGB")
+        xyz = colour.RGB_to_XYZ(np.clip(float64(values), 0, 1), "sRGB")
         lab.append(colour.XYZ_to_Lab(xyz))
-    return np.asarray(colour.delta_E(lab[0], lab[1], method="CIE 2000"), np.float64)
+    return float64(colour.delta_E(lab[0], lab[1], method="CIE 2000"))
 
 
 def _prepared(
     rendered: ArrayLike, photographed: ArrayLike, mask: Mask | None
 ) -> tuple[Float, Float, Mask]:
-    ours = np.asarray(rendered, np.float64)
-    theirs = np.asarray(photographed, np.float64)
+    ours = float64(rendered)
+    theirs = float64(photographed)
     if ours.shape != theirs.shape or ours.ndim != 3 or ours.shape[2] != 3:
         raise ValueError(
             f"both images must have the shape (h, w, 3), found {ours.shape} and {theirs.shape}"

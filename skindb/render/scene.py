@@ -25,7 +25,7 @@ from skindb.reflectance.kinds import even_diffuse, surface_model
 from skindb.reflectance.model import ReflectanceModel
 from skindb.render.image import read_exr
 from skindb.schema import FitStatus, check, variables
-from skindb.types import AnyArray, Array, Faces, Index, Mask
+from skindb.types import AnyArray, Array, Faces, Index, Mask, float64
 
 NEEDED = (
     variables.SURFEL_POSITION,
@@ -289,9 +289,9 @@ def subdivide_surface(surface: Surface, spacing: float, visible: Mask) -> Surfac
         for name in ("normals", "diffuse", "parameters", "s", "sigma_tr")
         if getattr(surface, name) is not None
     ]
-    values = {name: np.asarray(getattr(surface, name), np.float64) for name in names}
+    values = {name: float64(getattr(surface, name)) for name in names}
     values["shown"] = visible.astype(np.float64)[:, None]
-    vertices = np.asarray(surface.vertices, np.float64)
+    vertices = float64(surface.vertices)
     faces = np.asarray(surface.faces, np.int64)
     for _ in range(MAX_LEVELS):
         corners = vertices[faces]

@@ -15,7 +15,7 @@ from skindb.reflectance.model import Lamp, Points, ReflectanceModel
 from skindb.render.scene import usable_surfels
 from skindb.schema import FitStatus, TexelStatus, Use, check, names_of, variables
 from skindb.schema.declaration import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
-from skindb.types import Array, Bytes, Float32, Index32
+from skindb.types import Array, Bytes, Float32, Index32, float64
 
 Codes = Bytes
 STATUS = {FitStatus.FITTED: TexelStatus.MEASURED} | dict.fromkeys(
@@ -332,7 +332,7 @@ def _values_of(
 
 def _unit(name: str, direction: ArrayLike) -> Array:
     """Directions (..., 3) in double precision, checked to be unit vectors and then normalised."""
-    vectors = np.asarray(direction, np.float64)
+    vectors = float64(direction)
     if vectors.ndim == 0 or vectors.shape[-1] != 3:
         raise input_error(
             name,

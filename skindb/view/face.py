@@ -25,7 +25,7 @@ from skindb.render.surfels import surfel_confidence, with_matt_surfels
 from skindb.schema import variables
 from skindb.schema.consent import honour_consent
 from skindb.schema.notes import Omission
-from skindb.types import AnyArray, Array, Faces, Float32, Half
+from skindb.types import AnyArray, Array, Faces, Float32, Half, float64
 
 COUNT = 256  # lights, in 64 passes of four
 SKY_ROWS = 32  # rows of the image of the default sky
@@ -292,7 +292,7 @@ def diffusion_width(s: Array, eta: float) -> Array:
     eta
         Relative index of refraction.
     """
-    depth = np.maximum(np.asarray(s, float), S_FLOOR)  # z_r sigma_tr
+    depth = np.maximum(float64(s), S_FLOOR)  # z_r sigma_tr
     above = depth * (1 + 4 / 3 * boundary_factor(eta))
     # one source at depth z: the integral of R is exp(-z) / 2, that of r^2 R is z
     # exp(-z), in units of 1 / sigma_tr
@@ -318,9 +318,7 @@ def _values(surface: Surface, mixed: Array) -> dict[str, Array]:
     weights[:, : mixed.shape[1]] = mixed
     diffusion = np.zeros((len(surface.vertices), 3))
     if surface.sigma_tr is not None:
-        diffusion = np.nan_to_num(
-            1 / np.asarray(surface.sigma_tr, float), nan=0.0, posinf=0.0
-        )
+        diffusion = np.nan_to_num(1 / float64(surface.sigma_tr), nan=0.0, posinf=0.0)
     return {
         "albedo": np.maximum(surface.diffuse, MIN_ALBEDO),
         "weightA": weights[:, :4],

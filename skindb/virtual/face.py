@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from skindb.types import Float64
+from skindb.types import Float64, float64
 
 STEP = 0.02  # mm, of the central differences that give the normal
 REGIONS = (
@@ -103,7 +103,7 @@ def _cone(
     rb: float,
 ) -> Float64:
     """Round cone: a capsule from `a` to `b` whose radius runs from ra to rb."""
-    axis = np.asarray(b, float) - np.asarray(a, float)
+    axis = float64(b) - float64(a)
     x, y, z = (p[i] - a[i] for i in range(3))
     along = np.clip((x * axis[0] + y * axis[1] + z * axis[2]) / (axis @ axis), 0, 1)
     along = along * along * (3 - 2 * along)  # soft at both ends

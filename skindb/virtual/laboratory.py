@@ -17,7 +17,7 @@ import numpy as np
 
 from skindb.clock import Clock, SimulatedClock
 from skindb.errors import input_error
-from skindb.types import Float64, Index
+from skindb.types import Float64, Index, float64
 from skindb.virtual.devices import (
     GAUGE_FAULTS,
     DeviceFaults,
@@ -243,7 +243,7 @@ class Laboratory:
 
 
 def _read(path: Path) -> Float64:
-    return np.asarray(imagecodecs.png_decode(path.read_bytes()), np.float64)
+    return float64(imagecodecs.png_decode(path.read_bytes()))
 
 
 def laboratory_faults(

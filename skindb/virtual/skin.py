@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from skindb.files import package_json
 from skindb.optics.diffusion import dipole_s, scattering_coefficients
-from skindb.types import Float64
+from skindb.types import Float64, float64
 from skindb.virtual.head import Head
 from skindb.virtual.person import Person
 
@@ -302,9 +302,7 @@ def _sites(
         colour = diffuse[near].mean(axis=0)
         sigma_tr = np.clip(mean * personal * local * effect.translucency, 0.3, 3.0)
         s, _ = dipole_s(colour, eta=eta)
-        sigma_a, sigma_s = (
-            np.asarray(x, float) for x in scattering_coefficients(s, sigma_tr)
-        )
+        sigma_a, sigma_s = (float64(x) for x in scattering_coefficients(s, sigma_tr))
         sites.append(
             Site(name, head.vertices[vertex], colour, sigma_tr, sigma_a, sigma_s)
         )

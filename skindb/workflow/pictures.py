@@ -22,7 +22,7 @@ from skindb.render.scene import Camera, Environment, Lights
 from skindb.schema import variables
 from skindb.schema.consent import require_consent
 from skindb.store import Database, UnavailableError, require_fresh
-from skindb.types import Progress, silent
+from skindb.types import Progress, float64, silent
 from skindb.view.face import Trait, face_record, page_omissions, still_picture
 from skindb.view.landmarks import landmark_server, landmark_task
 from skindb.view.page import (
@@ -293,12 +293,9 @@ def _nose(model: xr.DataTree) -> np.ndarray[Any, np.dtype[np.float64]]:
     if variables.LANDMARK_POSITION in mesh and LANDMARK in [
         str(name) for name in mesh["landmark"].values
     ]:
-        return np.asarray(
-            mesh[variables.LANDMARK_POSITION].sel(landmark=LANDMARK).values, np.float64
-        )
-    return np.asarray(
-        model["fitted"].to_dataset()[variables.SURFEL_POSITION].values.mean(axis=0),
-        np.float64,
+        return float64(mesh[variables.LANDMARK_POSITION].sel(landmark=LANDMARK).values)
+    return float64(
+        model["fitted"].to_dataset()[variables.SURFEL_POSITION].values.mean(axis=0)
     )
 
 
