@@ -34,6 +34,7 @@ from benchmarks.real_photographs import (
 from skindb.fit import (
     embedded_dictionary,
     estimate_diffuse_reflectance,
+    estimate_gloss,
     estimate_light_gains,
     estimate_normals,
     fit_surface,
@@ -116,8 +117,9 @@ def skindb_fit(photographs: Photographs, training: Mask, *, eta: float) -> Fitte
         estimate_normals(samples, eta=eta, scan_error=NO_SCAN_DEGREES)
     )
     samples = samples.merge(estimate_diffuse_reflectance(samples, eta=eta))
+    gloss = estimate_gloss(samples, eta=eta, scan_error=NO_SCAN_DEGREES)
     samples = samples.assign(
-        refine_jointly(samples, eta=eta, scan_error=NO_SCAN_DEGREES)
+        refine_jointly(samples, eta=eta, scan_error=NO_SCAN_DEGREES, gloss=gloss)
     )
     mixture_model = Mixture.of_dictionary(dictionary)
     surface = fit_surface(samples, surface=mixture_model, eta=eta)

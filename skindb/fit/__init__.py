@@ -4,6 +4,7 @@ translucency.
 
 from skindb.fit.albedo import estimate_diffuse_reflectance
 from skindb.fit.corrections import estimate_light_gains, light_residuals
+from skindb.fit.gloss import estimate_gloss
 from skindb.fit.joint import refine_jointly
 from skindb.fit.kernels import compile_kernels
 from skindb.fit.lumitexels import lumitexels, sample_variance
@@ -37,6 +38,7 @@ __all__ = [
     "dictionary_report",
     "embedded_dictionary",
     "estimate_diffuse_reflectance",
+    "estimate_gloss",
     "estimate_light_gains",
     "estimate_normals",
     "find_obstructed",

@@ -23,7 +23,13 @@ from skindb.reflectance._lumitexel_kernels import (
     MIN_SAMPLES_GLOSS,
     MIN_SAMPLES_LOBES,
 )
-from skindb.reflectance.joint import JointFit, refine_block
+from skindb.reflectance.joint import (
+    SHARED_REFLECTANCE,
+    UNKNOWN_GLOSS,
+    Gloss,
+    JointFit,
+    refine_block,
+)
 from skindb.reflectance.model import MIN_LOBE_WIDTH, Comparison
 from skindb.schema import check
 from skindb.schema.declaration import LARGEST_R_D, SMALLEST_R_D
@@ -38,10 +44,6 @@ TOTAL_NOISE = 6.0
 TOTAL_ANGLE = 0.5
 # of a solution that has converged: above the rounding of its equations, 1e-7
 MAX_KKT = 1e-6
-# Relative error of R_d by the separation of few samples: with twice as much, R_d of a
-# planted surface is wrong by a quarter where the lights are close together; with half of
-# it, predictions of the cat of DiLiGenT are worse by a tenth.
-SEPARATED_ERROR = 0.2
 # what a surface of skin reflects, which R_d by Lambert's law includes
 MODEL_ERROR_LAMBERT = BARE_SKIN[0]
 REFINED = (
@@ -60,6 +62,7 @@ def refine_jointly(
     *,
     eta: float = 1.3,
     scan_error: float = SCAN_ERROR_DEGREES,
+    gloss: Gloss = UNKNOWN_GLOSS,
 ) -> xr.Dataset:
     """Normal and R_d, estimated together with the surface from estimates in sequence.
 
@@ -70,6 +73,8 @@ def refine_jointly(
         `estimate_normals` and `estimate_diffuse_reflectance`.
     eta, scan_error
         As in these functions.
+    gloss
+        From `estimate_gloss`: prior of the gloss of surfels with few samples.
 
     Returns
     -------
@@ -77,8 +82,9 @@ def refine_jointly(
         The variables of both functions, refined (see `skindb.reflectance.joint`); as
         given for surfels with fewer than three samples, whose parameters cannot be
         distinguished, or whose fit has not converged. The surface is one lobe of a fixed
-        width from four samples on, and eight lobes from twelve on; below four there is none,
-        and the total error of R_d includes all that the surface of skin reflects. R_d of
+        width from four samples on, whose strength is near that of the capture, and eight
+        lobes from twelve on; below four there is none, and the total error of R_d includes
+        all that the surface of skin reflects. R_d of
         captures with polarisers, measured behind crossed ones, is kept.
     """
     check(lumitexels, (*GEOMETRY, "surfel_normal", *REFINED), where="lumitexels")
@@ -96,9 +102,8 @@ def refine_jointly(
             comparison,
             scan_normal=arrays["surfel_normal"],
             scan_error=float(np.deg2rad(scan_error) / np.sqrt(2)),
+            gloss=gloss,
         )
-        refined = _with_separated(refined, arrays)
-        matt = refined.samples[:, None] < MIN_SAMPLES_GLOSS
         reflectance = np.clip(refined.diffuse, SMALLEST_R_D, LARGEST_R_D)
         columns = (
             refined.normal,
@@ -106,10 +111,7 @@ def refine_jointly(
             _total_angle(refined, arrays["shading_normal"]),
             reflectance,
             refined.diffuse_error,
-            np.hypot(
-                refined.diffuse_shared,
-                np.where(matt, MODEL_ERROR_LAMBERT, MODEL_ERROR_ALBEDO),
-            ),
+            _total_diffuse(refined, gloss),
             dipole_s(reflectance, eta=eta)[0],
         )
         converged = np.isfinite(refined.normal_error) & (refined.kkt < MAX_KKT)
@@ -134,21 +136,18 @@ def refine_jointly(
     )
 
 
-def _with_separated(refined: JointFit, arrays: Arrays) -> JointFit:
-    """R_d of surfels with few samples as the mean, by inverse variance, of the joint
-    estimate and of the separated one, which are wrong in different ways.
+def _total_diffuse(refined: JointFit, gloss: Gloss) -> Array:
+    """Total error (n, 3) of R_d, with what the surface may reflect more or less than it
+    does elsewhere in the capture.
     """
-    separated = arrays["diffuse_reflectance"]
-    # one of them may be 0, which is not exact
-    largest = np.fmax(separated, refined.diffuse)
-    spread = np.hypot(arrays["diffuse_reflectance_error"], SEPARATED_ERROR * largest)
-    weight = spread**2 / (spread**2 + refined.diffuse_error**2)
-    weight[refined.samples >= MIN_SAMPLES_LOBES] = 1.0
-    weight[refined.samples < MIN_SAMPLES_GLOSS] = 1.0
-    mean = separated + weight * (refined.diffuse - separated)
-    return refined._replace(
-        diffuse=mean, diffuse_error=np.sqrt(weight) * refined.diffuse_error
+    samples = refined.samples[:, None]
+    model = np.where(
+        samples < MIN_SAMPLES_GLOSS, MODEL_ERROR_LAMBERT, MODEL_ERROR_ALBEDO
     )
+    if gloss.strength > 0:
+        few = (samples >= MIN_SAMPLES_GLOSS) & (samples < MIN_SAMPLES_LOBES)
+        model = np.hypot(model, np.where(few, gloss.spread * SHARED_REFLECTANCE, 0.0))
+    return np.hypot(refined.diffuse_shared, model)
 
 
 def _total_angle(refined: JointFit, sequential: Array) -> Array:

@@ -26,6 +26,7 @@ from skindb.fit.corrections import (
     without_bounce,
 )
 from skindb.fit.energy import crossed_gloss, energy_prior, without_even_reflection
+from skindb.fit.gloss import estimate_gloss
 from skindb.fit.joint import refine_jointly
 from skindb.fit.lumitexels import lumitexels, relative_reflectance, scan_error
 from skindb.fit.normals import estimate_normals
@@ -190,7 +191,12 @@ def _fit_surfels(
     diffuse = estimate_diffuse_reflectance(samples.merge(estimates), eta=eta)
     estimates = estimates.merge(diffuse)
     estimates = estimates.assign(
-        refine_jointly(samples.merge(estimates), eta=eta, scan_error=prior)
+        refine_jointly(
+            samples.merge(estimates),
+            eta=eta,
+            scan_error=prior,
+            gloss=estimate_gloss(samples, eta=eta, scan_error=prior),
+        )
     )
     terms = fit_surface(
         samples.merge(estimates), surface=surface, mode=parameters.mode, eta=eta

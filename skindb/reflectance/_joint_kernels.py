@@ -23,7 +23,6 @@ from skindb.numerics._nnls_kernels import (
 from skindb.reflectance._lumitexel_kernels import (
     FITTED,
     MIN_COSINE_SURFACE,
-    MIN_SAMPLES_GLOSS,
     MIN_SAMPLES_LAMBERT,
     MIN_SAMPLES_LOBES,
     MODEL_ERROR,
@@ -63,10 +62,6 @@ WIDTH = SAMPLE + 3
 PARAMETERS = 3 + LOBES  # R_d and the strengths of the lobes
 UNKNOWNS = PARAMETERS + 2  # and two angles of the normal
 FEW_UNKNOWNS = 6  # R_d, the factor of the shared lobe and the normal
-# Standard deviation of the factor of the shared lobe, a prior. Without it, the lobe
-# explains all light of one in eight pixels of a face under six lights; with 3, predictions
-# of the cat of DiLiGenT under eight lights are worse by a sixth.
-GLOSS_SPREAD = 8.0
 MAX_STEP = 0.15  # rad
 DIFFERENCE = 1e-3  # rad, for derivatives by the normal
 KKT_TOLERANCE = 1e-8
@@ -80,6 +75,9 @@ class Lobes(NamedTuple):
 
     square: Vector32  # (LOBES,) squared roughness
     shared: Vector32  # (LOBES,) strengths of the one lobe of surfels with few samples
+    gloss: float  # mean factor of the shared lobe, of a prior
+    gloss_spread: float  # standard deviation of this factor
+    gloss_samples: int  # from which surfels have a lobe
     refractive_index: float  # of their Fresnel factor
     scan: Matrix  # (n, 3) unit normals of the scan
     scan_error: float  # rad, standard error of these about each axis
@@ -333,7 +331,9 @@ def _least_variance(count: int, b: Lumitexel, m: JointMemory) -> float:
 
 
 @kernel
-def _write_equations(count: int, lobes: int, b: Lumitexel, m: JointMemory) -> None:
+def _write_equations(
+    count: int, wide: int, lobes: Lobes, b: Lumitexel, m: JointMemory
+) -> None:
     """Write the normal equations of R_d, of the first lobes and of the normal, from the
     Gram matrix of the table, with the prior of the shared lobe.
     """
@@ -347,15 +347,15 @@ def _write_equations(count: int, lobes: int, b: Lumitexel, m: JointMemory) -> No
     for c in range(3):
         m.gram[c, c] = M[DIFFUSE, DIFFUSE]
         m.target[c] = M[DIFFUSE, SAMPLE + c]
-        for j in range(lobes):
+        for j in range(wide):
             m.gram[c, 3 + j] = M[DIFFUSE, LOBE + j]
             m.gram[3 + j, c] = M[DIFFUSE, LOBE + j]
             m.target[3 + j] += M[LOBE + j, SAMPLE + c]
         for k in range(2):
             m.cross[c, k] = m.x[c] * M[DIFFUSE, TURNED + k] + M[DIFFUSE, SURFACE + k]
             m.pull[k] += m.x[c] * M[TURNED + k, SAMPLE + c] + M[SURFACE + k, SAMPLE + c]
-    for i in range(lobes):
-        for j in range(lobes):
+    for i in range(wide):
+        for j in range(wide):
             m.gram[3 + i, 3 + j] = 3.0 * M[LOBE + i, LOBE + j]
         for k in range(2):
             shape = total * M[LOBE + i, TURNED + k]
@@ -365,7 +365,9 @@ def _write_equations(count: int, lobes: int, b: Lumitexel, m: JointMemory) -> No
             mixed = M[TURNED + k, SURFACE + q] + M[SURFACE + k, TURNED + q]
             m.turn[k, q] = squares * M[TURNED + k, TURNED + q] + total * mixed
             m.turn[k, q] += 3.0 * M[SURFACE + k, SURFACE + q]
-    m.gram[3, 3] += _least_variance(count, b, m) / GLOSS_SPREAD**2
+    precision = _least_variance(count, b, m) / lobes.gloss_spread**2
+    m.gram[3, 3] += precision
+    m.target[3] += precision * lobes.gloss
 
 
 @kernel
@@ -647,27 +649,27 @@ def _fit(
     _start(s, count, block, lobes, o.eta, b, m)
     narrowest = o.min_width * smallest_half_angle(count, b)
     limit = LOBES if count >= MIN_SAMPLES_LOBES else 1
-    wide = 1 if count >= MIN_SAMPLES_GLOSS else 0
+    wide = 1 if count >= lobes.gloss_samples else 0
     while 0 < wide < limit:
         if HALF_WIDTH * math.sqrt(lobes.square[wide]) < narrowest:
             break
         wide += 1
     _write_weights(s, count, block, o, b, m)
     _sum_table(count, m)
-    _write_equations(count, wide, b, m)
+    _write_equations(count, wide, lobes, b, m)
     _solve_parameters(count, lobes, m)
     for _ in range(lobes.steps):
         _write_weights(s, count, block, o, b, m)
         _write_derivatives(count, o.eta, lobes.square, b, m)
         _sum_table(count, m)
-        _write_equations(count, wide, b, m)
+        _write_equations(count, wide, lobes, b, m)
         _turn_normal(s, count, lobes, o.eta, b, m)
     _write_weights(s, count, block, o, b, m)
     _sum_table(count, m)
-    _write_equations(count, wide, b, m)
+    _write_equations(count, wide, lobes, b, m)
     out.samples[s] = count
     out.kkt[s] = _solve_parameters(count, lobes, m)
-    _write_equations(count, wide, b, m)
+    _write_equations(count, wide, lobes, b, m)
     _add_scan(s, _variance(count, b, m), lobes, m)
     _write_errors(s, count, b, m, out)
     for k in range(3):

@@ -56,10 +56,8 @@ from skindb.types import (
     UNDETERMINED,
 ) = (int(status) for status in FitStatus)
 # What the samples of a surfel support: three a normal and R_d by Lambert's law, four the
-# gloss too (normal and R_d together with one lobe of a fixed width), and twelve lobes of
-# eight widths. Chosen on 4 to 24 lights of the cat of DiLiGenT. Gloss from six samples on
-# would be better by 0.3 degrees for its normals under six lights, and worse for predictions
-# of eight faces of Extended Yale B under eight lights (docs/validation.md).
+# gloss too (normal and R_d together with one lobe whose strength is near that of the capture),
+# and twelve lobes of eight widths. Chosen on 4 to 24 lights of the cat of DiLiGenT.
 MIN_SAMPLES_LAMBERT = 3
 MIN_SAMPLES_GLOSS = 4
 MIN_SAMPLES_LOBES = 12

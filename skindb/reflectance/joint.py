@@ -11,20 +11,26 @@ vector: their peaks would be extrapolated.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from skindb.reflectance._joint_kernels import LOBES, JointFit, Lobes, fit_jointly
+from skindb.reflectance._lumitexel_kernels import MIN_SAMPLES_GLOSS
 from skindb.reflectance.block import kernel_block, kernel_options
 from skindb.reflectance.lobes import GRADED_ROUGHNESS, SURFACE_INDEX
 from skindb.reflectance.model import Block, Comparison
 from skindb.types import Array
 
-__all__ = ["JointFit", "refine_block"]
+__all__ = ["UNKNOWN_GLOSS", "Gloss", "JointFit", "refine_block"]
 
-# Strengths of the one lobe of surfels with 4 to 11 samples: that of the second width,
-# best of five under six and eight lights of the cat of DiLiGenT, second best under eight
-# lights of the faces.
-SHARED_LOBE = np.eye(LOBES, dtype=np.float32)[1]
+# Width of the one lobe of surfels with few samples: the best of three for eight faces of
+# Extended Yale B under 4 to 12 lights; the next narrower one would be better by a twentieth
+# for the cat of DiLiGenT.
+SHARED_WIDTH = 1
+SHARED_LOBE = np.eye(LOBES, dtype=np.float32)[SHARED_WIDTH]
+# fraction of light along the normal that it reflects at strength 1, by `GGX.normal_reflectance`
+SHARED_REFLECTANCE = 0.0176
 # rad; larger errors of the scan's normals, or no scan
 MAX_SCAN_ERROR = np.radians(15.0)
 # Gauss-Newton steps in the normal, and their fraction. Beside a scan the given normals
@@ -37,8 +43,27 @@ STEPS = (1, 0.7)
 STEPS_WITHOUT_SCAN = (4, 1.0)
 
 
+class Gloss(NamedTuple):
+    """Mean and standard deviation of the strength of the one lobe of surfels with few
+    samples, and the number of samples from which they have it.
+    """
+
+    strength: float
+    spread: float
+    samples: int = MIN_SAMPLES_GLOSS
+
+
+# Without it the lobe explains all light of one in eight pixels of a face under six lights.
+UNKNOWN_GLOSS = Gloss(0.0, 8.0)
+
+
 def refine_block(
-    block: Block, comparison: Comparison, *, scan_normal: Array, scan_error: float
+    block: Block,
+    comparison: Comparison,
+    *,
+    scan_normal: Array,
+    scan_error: float,
+    gloss: Gloss = UNKNOWN_GLOSS,
 ) -> JointFit:
     """Normal, R_d and strengths of the lobes of n surfels, from the given ones.
 
@@ -52,6 +77,8 @@ def refine_block(
         (n, 3) unit normals of the scan.
     scan_error
         Standard error of the scan's normals about each axis [rad], of a prior.
+    gloss
+        Prior of the lobe of surfels with fewer than twelve samples.
 
     Returns
     -------
@@ -74,6 +101,7 @@ def refine_block(
     lobes = Lobes(
         np.asarray(GRADED_ROUGHNESS**2, np.float32),
         SHARED_LOBE,
+        *gloss,
         SURFACE_INDEX,
         np.ascontiguousarray(scan_normal, np.float64),
         float(scan_error),

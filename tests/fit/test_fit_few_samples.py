@@ -14,11 +14,15 @@ from skindb.analysis.summary import summary_tables
 from skindb.fit import (
     FitParameters,
     estimate_diffuse_reflectance,
+    estimate_gloss,
     estimate_normals,
     fit_model,
     fit_surface,
     refine_jointly,
 )
+from skindb.reflectance.ggx import GGX
+from skindb.reflectance.joint import SHARED_REFLECTANCE, SHARED_WIDTH, UNKNOWN_GLOSS
+from skindb.reflectance.lobes import GRADED_ROUGHNESS, SURFACE_INDEX
 from skindb.reflectance.mixture import Mixture
 from skindb.render.scene import from_model
 from skindb.schema import FitStatus, dataset
@@ -94,7 +98,10 @@ def _fitted(lumitexels, dictionary, scan_error=60.0):
         estimate_normals(lumitexels, eta=ETA, scan_error=scan_error)
     )
     fitted = fitted.merge(estimate_diffuse_reflectance(fitted, eta=ETA))
-    fitted = fitted.assign(refine_jointly(fitted, eta=ETA, scan_error=scan_error))
+    gloss = estimate_gloss(lumitexels, eta=ETA, scan_error=scan_error)
+    fitted = fitted.assign(
+        refine_jointly(fitted, eta=ETA, scan_error=scan_error, gloss=gloss)
+    )
     surface = Mixture.of_dictionary(dictionary, rank=6)
     return fitted.merge(fit_surface(fitted, surface=surface, eta=ETA))
 
@@ -123,7 +130,7 @@ def test_few_samples__of_lambert_are_those_of_least_squares(count, small_diction
     # the prior of 60 degrees moves normals by up to 0.4
     assert _angle(fitted["shading_normal"].values, expected).max() < 0.5
     assert _angle(fitted["shading_normal"].values, normal).max() < 0.5
-    # with 4 to 11, lobes that are nearly even explain a part
+    # with 4 to 11, a wide lobe explains a part
     exact = 0.01 if count in (3, 12) else 0.1
     np.testing.assert_allclose(fitted["diffuse_reflectance"], diffuse, rtol=exact)
     weight = fitted["dictionary_weight"].values
@@ -142,7 +149,38 @@ def test_few_samples__of_a_glossy_surface_are_better_than_lambert(
     fitted = _fitted(lumitexels, small_dictionary)
     matt, _ = _least_squares(lumitexels, light)
     angle = _angle(fitted["shading_normal"].values, normal)
-    assert np.median(angle) < 0.7 * np.median(_angle(matt, normal))
+    # from four to six samples, which a surfel alone needs for its parameters, by the
+    # strength that the capture shares: without it they are better by 0.3 to 0.4
+    limit = 0.2 if count < 8 else 0.7
+    assert np.median(angle) < limit * np.median(_angle(matt, normal))
+
+
+@pytest.mark.parametrize("count", [4, 6, 8])
+def test_estimate_gloss__is_near_the_planted_strength(count):
+    """Of four strengths the one that predicts; the planted lobe is narrower."""
+    strength = []
+    for gloss in (0.0, STRENGTH / 4, STRENGTH):
+        lumitexels, _ = _planted(_lights(count), gloss=gloss, noise=0.01)
+        prior = estimate_gloss(lumitexels, eta=ETA, scan_error=60.0)
+        assert prior.spread == prior.strength / 2
+        strength.append(prior.strength)
+    level = np.median(R_D)
+    assert strength[0] < 1.2 * level
+    assert level < strength[1] < 5.0 * level
+    assert strength[2] > 14.0 * level
+
+
+def test_estimate_gloss__is_unknown_for_many_or_too_few_samples():
+    for count in (3, 65):
+        lumitexels, _ = _planted(_lights(count), gloss=STRENGTH)
+        prior = estimate_gloss(lumitexels, eta=ETA, scan_error=60.0)
+        assert prior == UNKNOWN_GLOSS
+
+
+def test_shared_reflectance__is_that_of_the_lobe():
+    lobe = np.array([[1.0, GRADED_ROUGHNESS[SHARED_WIDTH]]])
+    reflectance = GGX(SURFACE_INDEX).normal_reflectance(lobe)
+    np.testing.assert_allclose(SHARED_REFLECTANCE, reflectance[0], rtol=1e-3)
 
 
 @pytest.mark.parametrize("count", [3, 4, 6, 12])
@@ -161,7 +199,7 @@ def test_few_samples__errors_are_wider_for_fewer(small_dictionary):
     errors = ("normal_error", "normal_total_error", "diffuse_reflectance_total_error")
     medians = []
     for count in (4, 12):
-        lumitexels, _ = _planted(_lights(count), noise=0.02)
+        lumitexels, _ = _planted(_lights(count), gloss=STRENGTH / 2, noise=0.02)
         fitted = _fitted(lumitexels, small_dictionary)
         medians.append([float(np.median(fitted[name])) for name in errors])
     assert (np.array(medians[0]) > 1.5 * np.array(medians[1])).all()
@@ -204,7 +242,7 @@ def test_fit_model__of_a_few_photographs(count, surface, small_dictionary):
     model = fit_model(capture, parameters, dictionary=dictionary)
     fitted = model["fitted"].to_dataset()
     complete = fitted["fit_samples"].values == count
-    assert complete.mean() >= 0.5
+    assert complete.mean() >= 0.4
     status = FitStatus.LAMBERT if count == 3 else FitStatus.FITTED
     assert (fitted["fit_status"].values[complete] == status).all()
     wrong = np.abs(fitted["diffuse_reflectance"].values / skin.diffuse - 1)[complete]
