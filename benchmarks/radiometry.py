@@ -1,9 +1,8 @@
 """Error of responses and of light intensities, from simulated captures with known truth.
 
-python -m benchmarks radiometry CAPTURE... [--exposures FOLDER] [--photometric FOLDER]
+python -m benchmarks radiometry CAPTURE...
 
-The truth of each CAPTURE is in CAPTURE.truth.npz. FOLDER contains the published
-exposure stacks or the photographs of the chrome ball.
+The truth of each CAPTURE is in CAPTURE.truth.npz.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-import imagecodecs
 import numpy as np
 
 from benchmarks.truth import read_truth
@@ -24,13 +22,10 @@ from skindb.calibration.irradiance import (
     target_pixels,
 )
 from skindb.calibration.lights import (
-    ball_outline,
     calibrate_lights,
-    distant_light,
-    highlight_centre,
 )
 from skindb.calibration.radiance import frame_mergers, merge_exposures, read_view
-from skindb.calibration.response import ResponseOptions, recover_response
+from skindb.calibration.response import recover_response
 from skindb.format.folder import read_capture
 from skindb.format.frames import read_frame
 
@@ -167,56 +162,6 @@ def stated_errors(capture, truth):
     )
 
 
-def published_response(folder):
-    """Recovered response, published curves, and differences of their logarithms for the
-    stack frobisher.
-    """
-    names = [
-        folder / "frobisher" / f"IMG_{number}.jpg" for number in (2600, 2601, 2602)
-    ]
-    reference = np.load(
-        folder
-        / "frobisher"
-        / "reference"
-        / "test_camera_response_function_Debevec1997_crfs.npy"
-    )
-    stack = np.stack([imagecodecs.imread(str(name)) for name in names])
-    options = ResponseOptions(smoothness=1e-7)
-    response = recover_response(
-        stack, (0.125, 1.0, 8.0), black=0, white=255, options=options
-    )
-    values = np.arange(20, 251)
-    recovered = np.stack(
-        [
-            np.interp(values, response.table[:, 0], response.table[:, c])
-            for c in (1, 2, 3)
-        ],
-        axis=-1,
-    )
-    return response, reference, np.log(recovered / reference[values]).std(axis=0)
-
-
-def chrome_directions(folder):
-    """Angles (photograph,) in degrees between detected highlights and published directions."""
-    outline = ball_outline(
-        imagecodecs.imread(str(folder / "uw" / "chrome" / "chrome.mask.png"))[..., 0]
-        > 128
-    )
-    published = np.loadtxt(folder / "uw" / "light_directions_chrome.csv", delimiter=",")
-    angles = []
-    for number, expected in enumerate(published):
-        picture = imagecodecs.imread(
-            str(folder / "uw" / "chrome" / f"chrome.{number}.png")
-        )[..., :3]
-        cosine = (
-            distant_light(outline, highlight_centre(picture, outline))
-            @ expected
-            / np.linalg.norm(expected)
-        )
-        angles.append(np.degrees(np.arccos(min(cosine, 1.0))))
-    return np.array(angles)
-
-
 def print_captures(captures: Sequence[Path]) -> None:
     """Print a row for each capture, and biases of radiance where responses are curved."""
     print(
@@ -249,22 +194,6 @@ def print_captures(captures: Sequence[Path]) -> None:
             print(f"{name}, bias of radiance with the {response} response: {cells}")
 
 
-def main(
-    captures: Sequence[Path] = (),
-    *,
-    exposures: Path | None = None,
-    photometric: Path | None = None,
-) -> None:
-    """Print one table for the captures and one line for each set of published data."""
+def main(captures: Sequence[Path]) -> None:
+    """Print one table."""
     print_captures(captures)
-    if exposures:
-        print(
-            "frobisher, RMS difference of ln exposure, R G B:",
-            published_response(exposures)[2].round(4),
-        )
-    if photometric:
-        angles = chrome_directions(photometric)
-        print(
-            f"chrome ball: median {np.median(angles):.2f} degrees, largest "
-            f"{angles.max():.2f} degrees"
-        )

@@ -1,12 +1,12 @@
 """Errors on photographs of real faces and objects and on measured BRDFs, of skindb and
 of simple models.
 
-    python -m benchmarks real DATA [--parts faces cat lights sphere brdfs] [--json results.json]
+    python -m benchmarks real DATA [--parts faces cat ...] [--json results.json]
 
-DATA contains photometric/yale, photometric/diligent, photometric/uw and
-brdf/merl_slices_phid90.npz. A part whose files are absent is skipped with the reason.
-Every fifth light is held out. The error of a pixel is the RMS error of its held-out
-samples over their RMS, and the table has the median over pixels.
+DATA contains photometric/yale, photometric/diligent, photometric/uw, exposures,
+brdf/merl_slices_phid90.npz and optics/issa2025_skin.csv. A part whose files are absent
+is skipped with the reason. Every fifth light is held out. The error of a pixel is the RMS
+error of its held-out samples over their RMS, and the table has the median over pixels.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from benchmarks.peers import PEERS, Fit, fit, mixture
 from benchmarks.real_brdfs import brdf_rows
+from benchmarks.real_exposures import ball_rows, exposure_rows
 from benchmarks.real_photographs import (
     Photographs,
     cat,
@@ -31,6 +32,7 @@ from benchmarks.real_photographs import (
     gray_sphere,
     spread_lights,
 )
+from benchmarks.surface_energy import spectrum_rows
 from skindb.fit import (
     embedded_dictionary,
     estimate_diffuse_reflectance,
@@ -67,7 +69,16 @@ GAIN_ROUNDS = 3
 BASES = 4
 FEW_LIGHTS = 8
 LIGHT_COUNTS = (4, 6, 8, 12, 24)
-PARTS = ("faces", "cat", "lights", "sphere", "brdfs")
+PARTS = (
+    "faces",
+    "cat",
+    "lights",
+    "sphere",
+    "brdfs",
+    "exposures",
+    "ball",
+    "spectra",
+)
 
 ANGLE = "normals, mean, median [deg]"
 COVERAGE = "within the stated error, the total error [%]"
@@ -430,6 +441,9 @@ def measure(data: Path, part: str) -> list[list[str]] | str:
         "lights": photometric / "diligent" / "cat.npz",
         "sphere": photometric / "uw" / "light_directions_chrome.csv",
         "brdfs": data / "brdf" / "merl_slices_phid90.npz",
+        "exposures": data / "exposures" / "memorial",
+        "ball": photometric / "uw" / "light_directions_chrome.csv",
+        "spectra": data / "optics" / "issa2025_skin.csv",
     }[part]
     if not needed.exists():
         return f"{part}: skipped, {needed} does not exist"
@@ -441,6 +455,12 @@ def measure(data: Path, part: str) -> list[list[str]] | str:
         return light_rows(cat(needed.parent))
     if part == "sphere":
         return sphere_rows(gray_sphere(needed.parent))
+    if part == "exposures":
+        return exposure_rows(needed.parent)
+    if part == "ball":
+        return ball_rows(needed.parent)
+    if part == "spectra":
+        return spectrum_rows(needed)
     return brdf_rows(needed)
 
 

@@ -44,30 +44,35 @@ def white_part(red: NDArray[np.float64], blue: NDArray[np.float64]) -> float:
     )
 
 
-def row(name: str, part: NDArray[np.void]) -> str:
+def row(name: str, part: NDArray[np.void]) -> list[str]:
     """White part of some readings at each wavelength in blue."""
-    cells = [f"{white_part(part['R650'], part[blue]):.3f}" for blue in BLUE]
-    return f"| {name} | {len(part)} | {' | '.join(cells)} |"
+    values = [f"{white_part(part['R650'], part[blue]):.3f}" for blue in BLUE]
+    return [name, str(len(part)), *values]
 
 
-def main(spectra: Path) -> None:
-    """Print the white part of all readings and of parts of them, and the reflection of
-    dielectrics.
-    """
+def spectrum_rows(spectra: Path) -> list[list[str]]:
+    """White part of all readings and of parts of them."""
     table = np.genfromtxt(
         spectra, delimiter=",", names=True, dtype=None, encoding="utf-8"
     )
     sites = {"face": FACE, "arms": ARM, "back of the hand": HAND}
     table = table[np.isin(table["body_location"], sum(sites.values(), ()))]
-    print(f"| readings | number | {' | '.join(BLUE)} |\n|---|---|---|---|---|")
-    print(row("all", table))
+    rows = [["skin spectra: white part", "readings", *BLUE], row("all", table)]
     for name, places in sites.items():
-        print(row(name, table[np.isin(table["body_location"], places)]))
+        rows.append(row(name, table[np.isin(table["body_location"], places)]))
     for column in ("origin", "ethnicity"):
         for value in np.unique(table[column]):
             part = table[table[column] == value]
             if len(part) > MIN_READINGS:
-                print(row(f"{column} {value}", part))
+                rows.append(row(f"{column} {value}", part))
+    return rows
+
+
+def main(spectra: Path) -> None:
+    """Print the white part of readings, and the reflection of dielectrics."""
+    heading, *rows = spectrum_rows(spectra)
+    for cells in (heading, ["---"] * len(heading), *rows):
+        print(f"| {' | '.join(cells)} |")
     rough = " | ".join(f"GGX, alpha {alpha}" for alpha in ROUGHNESS)
     print(f"\n| refractive index | smooth | {rough} |\n|---|---|---|---|---|")
     for index in INDICES:
