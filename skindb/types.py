@@ -1,4 +1,4 @@
-"""Types shared by many modules."""
+"""Types that many modules share, and arrays of vectors."""
 
 from collections.abc import Callable
 from typing import Any
@@ -42,6 +42,8 @@ ByteMatrix = np.ndarray[tuple[int, int], np.dtype[np.uint8]]
 Real = float | np.floating[Any]
 Integer = int | np.integer[Any]
 
+MIN_LENGTH = 1e-12  # of a vector that has a direction; shorter ones are rounding
+
 # called with the stage, the steps done and the steps in all
 Progress = Callable[[str, int, int], None]
 
@@ -49,6 +51,16 @@ Progress = Callable[[str, int, int], None]
 def float64(values: ArrayLike) -> Float64:
     """An array in double precision; a copy only if it has another type."""
     return np.asarray(values, np.float64)
+
+
+def lengths(vectors: ArrayLike) -> AnyArray:
+    """Lengths (...) of vectors (..., d)."""
+    return np.asarray(np.linalg.norm(vectors, axis=-1))
+
+
+def unit(vectors: AnyArray) -> AnyArray:
+    """Vectors (..., d) over their lengths; those below MIN_LENGTH, such as 0, stay short."""
+    return np.asarray(vectors / np.maximum(lengths(vectors)[..., None], MIN_LENGTH))
 
 
 def silent(stage: str, done: int, total: int) -> None:

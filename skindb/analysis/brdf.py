@@ -36,7 +36,7 @@ from skindb.reflectance.reduction import Systems, factor_reflectance, residuals
 from skindb.reflectance.tables import TableGrid, brdf_metric
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
-from skindb.types import Array, Float32, Half, Index
+from skindb.types import Array, Float32, Half, Index, unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -541,7 +541,7 @@ def _surface_rows(
 def _directions(points: Array, position: Array) -> Array:
     """Unit directions (n, p, 3) from the surfels to the points."""
     d = points[None].astype(float) - position[:, None]
-    return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True))
+    return unit(d)
 
 
 def plot_basis_size(curve: xr.Dataset, *, ax: Axes | None = None) -> Axes:

@@ -13,7 +13,7 @@ from skindb import plots
 from skindb.optics.angles import half_difference
 from skindb.reflectance.tables import lookup
 from skindb.schema import variables
-from skindb.types import AnyArray, Array, Float32, Mask
+from skindb.types import AnyArray, Array, Float32, Mask, lengths
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -238,7 +238,7 @@ def _shaded(tables: AnyArray, normal: Array, light: Array) -> Array:
     wo_z = cos_o[lit]
     # local frame of the normal with the viewer in its x, z plane
     tangent = view - wo_z[:, None] * n
-    length = np.linalg.norm(tangent, axis=1, keepdims=True)
+    length = lengths(tangent)[..., None]
     tangent = np.where(
         length > 1e-9, tangent / np.maximum(length, 1e-9), [1.0, 0.0, 0.0]
     )

@@ -42,7 +42,7 @@ from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.label import FACE
 from skindb.schema.notes import note
-from skindb.types import Array, Mask
+from skindb.types import Array, Mask, lengths
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -554,9 +554,7 @@ def _statistics(
 
 def _angle(a: Array, b: Array) -> Array:
     """Angles [deg] between the rows (n, 3) of two arrays."""
-    cosine = (
-        (a * b).sum(axis=-1) / np.linalg.norm(a, axis=-1) / np.linalg.norm(b, axis=-1)
-    )
+    cosine = (a * b).sum(axis=-1) / lengths(a) / lengths(b)
     return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 

@@ -27,7 +27,7 @@ from skindb.geometry.warp import (
 from skindb.schema import dataset, variables
 from skindb.schema.consent import honour_consent
 from skindb.schema.notes import Note, note
-from skindb.types import Array, Float64, Index, float64
+from skindb.types import Array, Float64, Index, float64, lengths
 
 Takes = Mapping[str, xr.DataTree]
 Registered = Mapping[str, xr.Dataset]
@@ -315,9 +315,7 @@ def _registration_dataset(
         {
             variables.COMMON_UV: common,
             variables.COMMON_LANDMARK: target,
-            variables.LANDMARK_RESIDUAL: np.linalg.norm(
-                apply_warp(warp, source) - target, axis=1
-            ),
+            variables.LANDMARK_RESIDUAL: lengths(apply_warp(warp, source) - target),
             variables.LANDMARK_PREDICTION_ERROR: left_out_error(alone),
             variables.LANDMARK_USED: warp.used.astype(np.int8),
             variables.MM_PER_UV: _mm_per_uv(sheet.landmark, target),

@@ -29,7 +29,7 @@ from skindb.optics.transport import (
     random_walk,
     transport_profile,
 )
-from skindb.types import Array, Float32
+from skindb.types import Array, Float32, lengths
 
 ETA = 1.3
 FAR_OFF = 0.25  # relative error above which a fit counts as failed
@@ -300,7 +300,7 @@ def _every_pair(
     exitance = np.empty((LIGHTS, len(receivers), 3))
     for i, place in enumerate(receivers):
         near = np.flatnonzero(((points - place) ** 2).sum(axis=1) < PROFILE_REACH_MM**2)
-        r = np.linalg.norm(points[near] - place, axis=1)[:, None]
+        r = lengths(points[near] - place)[:, None]
         kernel = dipole_profile(r, absorbed, scattered, eta=ETA) * areas[near, None]
         exitance[:, i] = irradiance[near].T @ kernel / kernel.sum(axis=0) * diffuse
     return exitance

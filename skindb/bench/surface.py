@@ -28,7 +28,7 @@ from skindb.reflectance.mixture import Mixture, basis_rows
 from skindb.reflectance.model import Block, Comparison, Judgement, SurfaceFit
 from skindb.reflectance.reduction import reduce_dictionary
 from skindb.reflectance.tables import brdf_metric, lookup
-from skindb.types import Array
+from skindb.types import Array, lengths
 
 ETA = 1.3
 DISC = float(np.radians(0.8))
@@ -94,7 +94,7 @@ def _single(values: Array) -> Array:
 
 def unit(v: Array) -> Array:
     """Vectors (..., 3) of length one."""
-    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
+    return np.asarray(v / lengths(v)[..., None])
 
 
 def strip(

@@ -39,7 +39,7 @@ from skindb.format.dome import (
     Pinhole,
 )
 from skindb.schema import GROUPS, dataset
-from skindb.types import Float32, Float64, float64
+from skindb.types import Float32, Float64, float64, lengths
 
 # the manufacturer's reference values, as in colour-science
 CHART = "ColorChecker24 - After November 2014"
@@ -448,7 +448,7 @@ def reprojection_error(
         No point remains.
     """
     residual = float64(pixels) - camera.project(points)
-    length = np.linalg.norm(residual, axis=-1)
+    length = lengths(residual)
     observed = length[np.isfinite(length)]
     require(
         len(observed),

@@ -18,7 +18,7 @@ from skindb.format.frames import Digests, Frame, read_frame, read_frames
 from skindb.limits import MAX_FIBRE_PIXELS
 from skindb.numerics.statistics import robust_deviation
 from skindb.schema import dataset
-from skindb.types import Float64, Index, Mask, float64
+from skindb.types import Float64, Index, Mask, float64, lengths
 
 # fraction of a fibre's pixels that may be missing in a channel (stuck ones): for a
 # fibre whose centre is 50 % above its mean brightness, the signal is then 0.5 % too
@@ -332,7 +332,7 @@ def match_fibres(spots: Spots, stated: Spots) -> SpotOffsets:
     square = ((stated.centre[:, None] - spots.centre) ** 2).sum(axis=-1)
     _, order = optimize.linear_sum_assignment(square)
     offset = spots.centre[order] - stated.centre
-    distance = np.linalg.norm(offset, axis=1)
+    distance = lengths(offset)
     count = int((distance > stated.radius).sum())
     require(
         not count,

@@ -16,7 +16,7 @@ from skindb.errors import attempt_all, require
 from skindb.format.dome import CameraRecord, DomeRecord, LightRecord, WhiteRecord
 from skindb.format.frames import Digests
 from skindb.numerics.statistics import robust_deviation
-from skindb.types import Float64, Index, Mask, float64
+from skindb.types import Float64, Index, Mask, float64, lengths
 
 # of the half size: a disc inside the square, however the square is rotated
 TARGET_INTERIOR_FRACTION = 0.8
@@ -156,7 +156,7 @@ def _target_rows(
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (white.point - centre) @ white.normal / (ray @ white.normal)
         points = centre + distance[..., None] * ray
-        radius = np.linalg.norm(points - white.point, axis=-1)
+        radius = lengths(points - white.point)
         inside = (distance > 0) & (radius < TARGET_INTERIOR_FRACTION * white.half_size)
     return inside, points[inside]
 
@@ -287,7 +287,7 @@ def _light_geometry(
     the angle to the axis of the light.
     """
     way = target.points - position
-    distance = np.linalg.norm(way, axis=1)
+    distance = lengths(way)
     return distance, -(way @ target.normal) / distance, (way @ target.axis) / distance
 
 

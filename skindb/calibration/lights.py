@@ -36,7 +36,7 @@ from skindb.format.dome import (
 from skindb.format.frames import CAMERA, LIGHT, filled, read_frame
 from skindb.parameters import POSITION_ERROR_MM
 from skindb.schema import dataset
-from skindb.types import Float64, Mask, float64
+from skindb.types import Float64, Mask, float64, lengths
 
 # of the contrast over the ball; pixels above it belong to the highlight
 HIGHLIGHT_FRACTION = 0.5
@@ -249,7 +249,7 @@ def ball_centre(
     if len(cameras) == 1:
         return np.asarray(start[0] + distances[0] * directions[0])
     centre = light_position(start, directions).position
-    ratio = np.linalg.norm(centre - start, axis=1) / np.array(distances)
+    ratio = lengths(centre - start) / np.array(distances)
     mismatch = float(np.abs(ratio - 1).max())
     require(
         not mismatch > MAX_SIZE_MISMATCH,
@@ -308,7 +308,7 @@ def light_position(origins: ArrayLike, directions: ArrayLike) -> LightPosition:
         position = np.linalg.solve(normal, moment)
         weight = 1 / ((position - start) ** 2).sum(axis=1)
     offset = np.einsum("rij,rj->ri", across, position - start)
-    angle = np.linalg.norm(offset, axis=1) * np.sqrt(weight)
+    angle = lengths(offset) * np.sqrt(weight)
     variance = float((angle**2).sum()) / max(2 * len(start) - 3, 1)
     covariance = variance * np.linalg.inv(np.einsum("r,rij->ij", weight, across))
     return LightPosition(position, covariance, np.degrees(angle))

@@ -32,7 +32,7 @@ from skindb.render.scene import (
 )
 from skindb.render.shading import View, shade_view, trace_view
 from skindb.schema import variables
-from skindb.types import Array, Bytes, Mask
+from skindb.types import Array, Bytes, Mask, lengths, unit
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -217,10 +217,8 @@ def _frontal(
 def _key(dome: xr.Dataset) -> Lights:
     """Two lights of the dome, one from each side."""
     place = dome[variables.LIGHT_POSITION].values
-    place = place / np.linalg.norm(place, axis=1, keepdims=True)
-    directions = np.array(KEY_LIGHTS) / np.linalg.norm(
-        KEY_LIGHTS, axis=1, keepdims=True
-    )
+    place = unit(place)
+    directions = np.array(KEY_LIGHTS) / lengths(KEY_LIGHTS)[..., None]
     return lights_from_dome(dome).select(np.argmax(directions @ place.T, axis=1))
 
 

@@ -20,7 +20,7 @@ from skindb.optics.diffusion import (
 )
 from skindb.render.surfels import with_matt_surfels
 from skindb.schema import check, variables
-from skindb.types import Array, float64
+from skindb.types import Array, float64, lengths
 
 REQUIRED = (
     variables.SURFEL_POSITION,
@@ -54,7 +54,7 @@ def texture_size(model: xr.DataTree) -> int:
     uv = model["fitted"].to_dataset()[variables.SURFEL_UV].values
     triangles = model["mesh"].to_dataset()[variables.TRIANGLE].values
     corners = uv.astype(float)[triangles]
-    edge = np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1))
+    edge = np.median(lengths(corners - np.roll(corners, 1, axis=1)))
     texels = TEXELS_PER_SPACING / max(float(edge), 1e-6)
     return int(np.clip(2 ** np.ceil(np.log2(texels)), MIN_SIZE, MAX_SIZE))
 
@@ -105,7 +105,7 @@ def required(model: xr.DataTree) -> xr.Dataset:
     InputError
         If variables are missing, or the texture coordinates are not finite or cover no area.
     """
-    fitted = with_matt_surfels(model["fitted"].to_dataset())
+    fitted = model["fitted"].to_dataset()
     check(fitted, REQUIRED, where="fitted")
     corner = (
         fitted[variables.SURFEL_UV]
@@ -124,7 +124,7 @@ def required(model: xr.DataTree) -> xr.Dataset:
             fault,
             "ingest and fit the capture again",
         )
-    return fitted
+    return with_matt_surfels(fitted)
 
 
 def describe_edit(attrs: Mapping[Any, Any]) -> dict[str, Any] | None:

@@ -11,7 +11,16 @@ from skindb.geometry.atlas import atlas_values, push_pull, rasterise_atlas
 from skindb.reflectance.kinds import as_mixture, even_diffuse
 from skindb.render.surfels import surfel_confidence, surfel_texels, texel_codes
 from skindb.schema import VARIABLES, TexelStatus, variables
-from skindb.types import AnyArray, Array, Faces, Float32, Float64, Index32
+from skindb.types import (
+    AnyArray,
+    Array,
+    Faces,
+    Float32,
+    Float64,
+    Index32,
+    lengths,
+    unit,
+)
 
 Image = Float32
 MEASURED = {  # map: variable of the model; edited models have none of these
@@ -258,7 +267,7 @@ def _single_channel(values: AnyArray, doc: str) -> TextureMap:
 def _fitted_maps(image: Image, layout: dict[str, slice]) -> dict[str, TextureMap]:
     rgb = ("R", "G", "B")
     normal = image[..., layout[variables.SHADING_NORMAL]]
-    normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    normal = unit(normal)
     maps = {
         "albedo": TextureMap(
             image[..., layout[variables.DIFFUSE_REFLECTANCE]],
@@ -274,7 +283,7 @@ def _fitted_maps(image: Image, layout: dict[str, slice]) -> dict[str, TextureMap
         ),
     }
     bent = image[..., layout["tangent"]]
-    bent = bent / np.maximum(np.linalg.norm(bent, axis=-1, keepdims=True), 1e-12)
+    bent = unit(bent)
     doc = (
         "unit shading normal, with its parts along tangent, bitangent (towards v = 0) "
         "and normal in R, G, B"
@@ -315,21 +324,16 @@ def tangent_frames(
     along_u = (edge[:, 0] * step[:, 1, 1:] - edge[:, 1] * step[:, 0, 1:]) * scale
     # towards decreasing v
     up = -(edge[:, 1] * step[:, 0, :1] - edge[:, 0] * step[:, 1, :1]) * scale
-    along_u, up = (
-        x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-30)
-        for x in (along_u, up)
-    )
+    along_u, up = (x / np.maximum(lengths(x)[..., None], 1e-30) for x in (along_u, up))
     sums = np.zeros((2, len(position), 3))
     for k in range(3):
         a, b = (corner[:, (k + i) % 3] - corner[:, k] for i in (1, 2))
-        cosine = (a * b).sum(axis=1) / np.maximum(
-            np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1), 1e-30
-        )
+        cosine = (a * b).sum(axis=1) / np.maximum(lengths(a) * lengths(b), 1e-30)
         angle = np.arccos(np.clip(cosine, -1, 1))[:, None]
         for total, direction in zip(sums, (along_u, up), strict=True):
             np.add.at(total, triangles[:, k], direction * angle)
     tangent = sums[0] - (sums[0] * normal).sum(axis=1, keepdims=True) * normal
-    length = np.linalg.norm(tangent, axis=1, keepdims=True)
+    length = lengths(tangent)[..., None]
     tangent = np.where(
         length > 1e-9, tangent / np.maximum(length, 1e-9), _any_perpendicular(normal)
     )
@@ -354,4 +358,4 @@ def to_tangent_space(direction: Array, normal: Array, tangent: Array) -> Float64
 def _any_perpendicular(normal: Array) -> Float64:
     axis = np.where(np.abs(normal[:, :1]) < 0.9, [[1.0, 0, 0]], [[0.0, 1, 0]])
     tangent = np.cross(normal, axis)
-    return np.asarray(tangent / np.linalg.norm(tangent, axis=1, keepdims=True))
+    return unit(tangent)

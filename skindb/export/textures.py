@@ -20,7 +20,17 @@ from skindb.reflectance.tables import kernel_tables, lookup
 from skindb.render.image import encode_srgb
 from skindb.render.surfels import surfel_confidence
 from skindb.schema import variables
-from skindb.types import AnyArray, Array, Bytes, Float32, Float64, Index, float64
+from skindb.types import (
+    AnyArray,
+    Array,
+    Bytes,
+    Float32,
+    Float64,
+    Index,
+    float64,
+    lengths,
+    unit,
+)
 
 # values of perceptual roughness that are tried for each point
 ROUGHNESS = np.linspace(0.1, 1.0, 46)
@@ -526,9 +536,7 @@ def _columns(
 def _textures(values: dict[str, Float32]) -> dict[str, Bytes]:
     """8-bit textures, by their name in the material."""
     full = np.full(values["roughness"].shape, 255, np.uint8)
-    bent = values["bent"] / np.maximum(
-        np.linalg.norm(values["bent"], axis=-1, keepdims=True), 1e-9
-    )
+    bent = unit(values["bent"])
     pictures = {
         "baseColor": _eight_bits(encode_srgb(values["base"])),
         "metallicRoughness": np.concatenate(
@@ -570,7 +578,7 @@ def _normal_error(picture: Bytes, shape: Shape, surfels: Index) -> float:
     normals = (
         bent[:, :1] * tangent[:, :3] + bent[:, 1:2] * bitangent + bent[:, 2:] * normal
     )
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    normals = unit(normals)
     cosine = np.clip((normals * shape.shading[surfels]).sum(axis=1), -1, 1)
     return float(np.degrees(np.median(np.arccos(cosine))))
 
@@ -583,5 +591,5 @@ def unit_normals(fitted: xr.Dataset, name: str) -> Float64:
         normal,
         fitted[variables.SURFEL_NORMAL].values,
     )
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    length = lengths(normal)[..., None]
     return np.where(length > 1e-6, normal / np.maximum(length, 1e-6), [0.0, 0.0, 1.0])

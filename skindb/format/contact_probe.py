@@ -31,7 +31,7 @@ from skindb.format.frames import (
 )
 from skindb.format.sensor import SensorRecord, read_sensor
 from skindb.limits import MAX_FIBRES, MAX_PLACEMENTS, MAX_PRESSURE_SAMPLES, MAX_SITES
-from skindb.types import Float64
+from skindb.types import Float64, lengths
 
 # mm, of the farthest fibre: light does not scatter within a tenth of a millimetre
 FIBRE_DISTANCES_MM = (0.1, 300.0)
@@ -271,7 +271,7 @@ def _require_separate_discs(fields: Fields, centre: Float64, radius: Float64) ->
     """Require discs (n, 2) and (n,) px that do not overlap; the fault names the pair
     that overlaps most.
     """
-    gap = np.linalg.norm(centre[:, None] - centre, axis=-1)
+    gap = lengths(centre[:, None] - centre)
     closeness = gap / (MIN_CENTRE_DISTANCE_FRACTION * (radius[:, None] + radius))
     closeness[np.tril_indices(len(radius))] = np.inf
     if count := int((closeness < 1).sum()):

@@ -40,6 +40,7 @@ from skindb.types import (
     Index32,
     Mask,
     float64,
+    lengths,
 )
 
 EQUALISATION_ROUNDS = 9  # of area equalisation
@@ -202,7 +203,7 @@ def _intrinsic_weights(points: Array, faces: Index) -> sp.csr_matrix:
     """
     n = len(points)
     weights = sp.csr_matrix((n, n))
-    area = np.linalg.norm(face_crosses(points, faces), axis=1) / 2
+    area = lengths(face_crosses(points, faces)) / 2
     around = np.bincount(faces.ravel(), np.repeat(area, 3), minlength=n) / 3
     # across corner k
     sides = [
@@ -242,8 +243,8 @@ def _mean_value_weights(points: Array, faces: Index) -> sp.csr_matrix:
         here, after, before = np.roll(faces, -k, axis=1).T
         to_left = points[after] - points[here]
         to_right = points[before] - points[here]
-        a = np.maximum(np.linalg.norm(to_left, axis=1), tiny)
-        b = np.maximum(np.linalg.norm(to_right, axis=1), tiny)
+        a = np.maximum(lengths(to_left), tiny)
+        b = np.maximum(lengths(to_right), tiny)
         cosine = np.einsum("ni,ni->n", to_left, to_right) / (a * b)
         # at least 1e-6 and at most 1e6, so that coinciding or opposite sides have
         # positive, finite weights
@@ -289,7 +290,7 @@ def _equalised(surface: Surface, weights: sp.csr_matrix) -> list[tuple[Float64, 
     points = surface.points
     faces = surface.faces
     real = slice(0, surface.real)  # excludes the caps of holes
-    area = np.linalg.norm(face_crosses(points, faces), axis=1) / 2
+    area = lengths(face_crosses(points, faces)) / 2
     around = np.bincount(faces.ravel(), np.repeat(area, 3), minlength=len(points))
     maps: list[tuple[float, float, Float64]] = []  # energy, sd of log2 area, uv
     for _ in range(EQUALISATION_ROUNDS):
@@ -316,7 +317,7 @@ def _equalised(surface: Surface, weights: sp.csr_matrix) -> list[tuple[Float64, 
 
 def _upright(uv: Array, points: Array, faces: Index) -> Float64:
     """Turn the disc so that height y grows upwards in the map, and move it into the unit square."""
-    double_area = np.linalg.norm(face_crosses(points, faces), axis=1)
+    double_area = lengths(face_crosses(points, faces))
     area = np.bincount(faces.ravel(), np.repeat(double_area, 3))
     height = points[:, 1] - area @ points[:, 1] / area.sum()
     up = (area * height) @ (uv - area @ uv / area.sum())
@@ -380,7 +381,7 @@ def _stretches(
     s, t = float64(uv[faces.T].transpose(2, 0, 1))
     pq = q - p
     pr = r - p
-    area = np.linalg.norm(np.cross(pq, pr), axis=1) / 2
+    area = lengths(np.cross(pq, pr)) / 2
     double = (s[1] - s[0]) * (t[2] - t[0]) - (t[1] - t[0]) * (s[2] - s[0])
     flat = double == 0
     safe = np.where(flat, 1.0, double)[:, None]

@@ -24,7 +24,7 @@ from skindb.geometry.mesh import (
     simple_loops,
     winding_flips,
 )
-from skindb.types import Faces, Float64, Index, Mask, float64
+from skindb.types import Faces, Float64, Index, Mask, float64, lengths
 
 # of the diagonal of the mesh: 0.3 um on a face, far below any scanner's spacing
 WELD_DISTANCE_RATIO = 1e-6
@@ -212,7 +212,7 @@ def _drop_overfull(points: Float64, faces: Index, report: _Report) -> Index:
             break
         label = face_components(faces)
         free = (table.count[table.of_face] == 1).sum(axis=1)
-        area = np.linalg.norm(face_crosses(points, faces), axis=1)
+        area = lengths(face_crosses(points, faces))
         edge = table.of_face[face, side]
         size = np.bincount(label)[label]
         order = np.lexsort((area[face], -free[face], size[face], edge))
@@ -238,7 +238,7 @@ def _orient(points: Float64, faces: Index, report: _Report) -> Index:
 
 def _largest_component(points: Float64, faces: Index, report: _Report) -> Index:
     label = face_components(faces) if len(faces) else np.zeros(0, np.int64)
-    area = np.linalg.norm(face_crosses(points, faces), axis=1)
+    area = lengths(face_crosses(points, faces))
     keep = np.asarray(label == np.bincount(label, area, minlength=1).argmax(), bool)
     touching = np.isin(faces, faces[keep]).any(axis=1)
     hanging = ~keep & np.isin(label, label[touching])
@@ -300,7 +300,7 @@ def _outwards(points: Float64, faces: Index, report: _Report) -> Index:
     origin = points[loops[0]].mean(axis=0) if loops else points[faces[0, 0]]
     cross = face_crosses(points, faces)
     volume = float(np.einsum("fi,fi->", points[faces[:, 0]] - origin, cross)) / 6
-    scale = (float(np.linalg.norm(cross, axis=1).sum()) / 2) ** 1.5
+    scale = (float(lengths(cross).sum()) / 2) ** 1.5
     inside_out = volume < -MIN_VOLUME_RATIO * scale
     report.count["turned_mesh"] = int(inside_out)
     return faces[:, ::-1] if inside_out else faces
@@ -336,7 +336,7 @@ def sliver_mask(
     p = float64(vertices)[faces]
     sides = p - np.roll(p, -1, axis=1)
     longest = np.einsum("fki,fki->fk", sides, sides).max(axis=1, initial=0.0)
-    double_area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    double_area = lengths(np.cross(sides[:, 0], sides[:, 1]))
     return np.asarray(double_area <= min_ratio * longest)
 
 
@@ -376,7 +376,7 @@ def fill_hole(
             middle = np.arange(i + 1, k)
             ends = np.full((k - i - 1, 2), [i, k])
             corners = np.column_stack([ends[:, 0], middle, ends[:, 1]])
-            area = np.linalg.norm(np.cross(p[middle] - p[i], p[k] - p[i]), axis=1)
+            area = lengths(np.cross(p[middle] - p[i], p[k] - p[i]))
             area[sliver_mask(p, corners, MIN_FILL_HEIGHT_RATIO)] = np.inf
             total = cost[i, middle] + cost[middle, k] + area
             split[i, k] = middle[total.argmin()]
@@ -455,7 +455,7 @@ def _repair(vertices: Float64, patch: _Patch, i: int) -> bool:
     corner = patch.faces[i]
     if corner[0] < 0 or not sliver_mask(vertices, corner[None])[0]:
         return False  # removed by an earlier repair
-    side = np.linalg.norm(vertices[np.roll(corner, -1)] - vertices[corner], axis=1)
+    side = lengths(vertices[np.roll(corner, -1)] - vertices[corner])
     short = int(side.argmin())
     long = int(side.argmax())
     ends = int(corner[short]), int(corner[(short + 1) % 3])

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import csr_array, vstack
 
 from skindb.geometry.rays import RAY_OFFSET_MM, RayScene
-from skindb.types import Array, Faces, Index
+from skindb.types import Array, Faces, Index, unit
 
 # per vertex, cosine distributed: the error of the incoming light is an eighth of its
 # standard deviation
@@ -77,7 +77,7 @@ def bounce_transfer(
 def tangent_frames(normal: Array) -> Array:
     """Two tangents and the normal of each of n normals, in the rows of (n, 3, 3)."""
     tangent = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    tangent = unit(tangent)
     return np.stack([tangent, np.cross(normal, tangent), normal], axis=1)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.spatial import cKDTree
 
-from skindb.types import Array, Faces, Float64, Index, Mask, float64
+from skindb.types import Array, Faces, Float64, Index, Mask, float64, lengths
 
 MORTON_BITS = 21  # per axis: 63 bits in all
 POINTS_PER_BLOCK = 1 << 10  # each point may have a hundred candidate triangles
@@ -86,7 +86,7 @@ def simple_loops(loop: Index) -> list[Index]:
 
 def side_lengths(path: Array) -> Float64:
     """Length of each side of a closed path (n, d)."""
-    return np.asarray(np.linalg.norm(np.roll(path, -1, axis=0) - path, axis=1))
+    return lengths(np.roll(path, -1, axis=0) - path)
 
 
 def outline_first(points: Array, loops: list[Index]) -> list[Index]:
@@ -199,7 +199,7 @@ def vertex_normals(vertices: Array, faces: Faces) -> Float64:
     NaN at a vertex of no triangle, or whose triangles cancel.
     """
     total = _sum_at_vertices(face_crosses(vertices, faces), faces, len(vertices))
-    length = np.linalg.norm(total, axis=1, keepdims=True)
+    length = lengths(total)[..., None]
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(length > 0, total / length, np.nan)
 
@@ -208,7 +208,7 @@ def vertex_areas(vertices: Array, faces: Faces) -> Float64:
     """Areas (v,) in mm2: a third of each triangle goes to each corner, so that the sum
     is the area of the mesh.
     """
-    area = np.linalg.norm(face_crosses(vertices, faces), axis=1, keepdims=True) / 6
+    area = lengths(face_crosses(vertices, faces))[..., None] / 6
     return _sum_at_vertices(area, faces, len(vertices))[:, 0]
 
 
@@ -269,13 +269,13 @@ def closest_on_mesh(
         point = p[block][row]
         weight = _closest(point, triangles[candidate])
         place = np.einsum("nk,nkc->nc", weight, triangles[candidate])
-        distance = np.linalg.norm(place - point, axis=1)
+        distance = lengths(place - point)
         order = np.lexsort((candidate, distance, row))
         best = order[np.searchsorted(row[order], np.arange(len(p[block])))]
         face[block] = candidate[best]
         barycentric[block] = weight[best]
     place = np.einsum("nk,nkc->nc", barycentric, triangles[face])
-    return face, barycentric, np.linalg.norm(place - p, axis=1)
+    return face, barycentric, lengths(place - p)
 
 
 @dataclass(frozen=True)
@@ -292,7 +292,7 @@ def _by_reach(triangles: Array) -> list[_Class]:
     ones do not slow the others.
     """
     middle = triangles.mean(axis=1)
-    reach = np.linalg.norm(triangles - middle[:, None], axis=2).max(axis=1)
+    reach = lengths(triangles - middle[:, None]).max(axis=1)
     octave = np.frexp(np.maximum(reach, np.median(reach)))[1]
     classes = [np.flatnonzero(octave == size) for size in np.unique(octave)]
     return [
@@ -373,7 +373,7 @@ def winding_number(vertices: Array, faces: Faces, points: Array) -> Float64:
     numbers = []
     for point in float64(points).reshape(-1, 3):
         a, b, c = (triangles[:, i] - point for i in range(3))
-        la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
+        la, lb, lc = (lengths(side) for side in (a, b, c))
         # van Oosterom and Strackee 1983
         volume = _dot(a, np.cross(b, c))
         scale = la * lb * lc + _dot(a, b) * lc + _dot(b, c) * la + _dot(c, a) * lb

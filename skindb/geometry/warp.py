@@ -17,7 +17,7 @@ from skindb.geometry.mesh import (
     vertex_areas,
     vertex_normals,
 )
-from skindb.types import Array, Float64, Index, Mask, float64
+from skindb.types import Array, Float64, Index, Mask, float64, lengths
 
 # of the spread of the points: half a millimetre on a face, less than the error of a
 # click
@@ -220,7 +220,7 @@ def left_out_error(warp: Warp) -> Float64:
     if len(warp.centre):
         inverse = _System.of(warp.centre, warp.loose).inverse(warp.smoothing)
         # divided by the root of 1: none is weak
-        error = np.linalg.norm(warp.weight, axis=1) / np.diag(inverse)
+        error = lengths(warp.weight) / np.diag(inverse)
         out[warp.used] = error[: warp.used.sum()]
     return out
 
@@ -410,7 +410,7 @@ def anchor_vertices(sheet: Sheet) -> Index:
     for _ in range(min(INNER_POINTS, len(vertices))):
         farthest = int(distance.argmax())
         inner.append(farthest)
-        to_farthest = np.linalg.norm(points - points[farthest], axis=1)
+        to_farthest = lengths(points - points[farthest])
         distance = np.minimum(distance, to_farthest)
     along = np.linspace(0, len(sheet.outline), OUTLINE_POINTS, endpoint=False)
     outline = sheet.outline[along.astype(np.int64)]
@@ -464,7 +464,7 @@ def _aligned(
     n = len(clicks)
     # the landmarks first, then the chosen points
     points = np.concatenate([clicks @ matrix + shift, start])
-    distances = np.linalg.norm(points[:, None] - points, axis=2)
+    distances = lengths(points[:, None] - points)
     kernel = DEFORMATION_SD_MM**2 * _matern(distances / DEFORMATION_LENGTH_MM)
     pull = np.concatenate([take.landmark[shared] - points[:n], np.zeros_like(start)])
     error = np.tile(CLICK_SD_MM**2 * np.eye(3), (len(points), 1, 1))
@@ -486,7 +486,7 @@ def _aligned(
         close = distance < MAX_ALIGNING_DISTANCE_MM
         is_used[n:] = close & facing & ~take.rim[near] & ~on_rim
         if i == OUTLINE_ROUND:
-            gap = np.linalg.norm(take.position[outline] - aligned[on_rim], axis=1)
+            gap = lengths(take.position[outline] - aligned[on_rim])
             same_outline = bool(np.quantile(gap, 0.9) < MAX_OUTLINE_DISTANCE_MM)
         if same_outline:
             ends = n + np.flatnonzero(on_rim)

@@ -11,7 +11,7 @@ import numpy as np
 from skindb.errors import Fault
 from skindb.format.dome import DomeRecord
 from skindb.ingest.consistency import MAX_OFFSET_MM, MIN_AGREEMENT, Calibration
-from skindb.types import Float64
+from skindb.types import Float64, lengths
 
 MIN_MEDIAN_SAMPLES = 50  # of a view, for a reliable median
 # of a light to the median one, in a channel: lights of a dome differ by tens of
@@ -333,7 +333,7 @@ def _camera_notes(dome: DomeRecord, calibration: Calibration) -> Iterator[str]:
 
 def _light_notes(dome: DomeRecord, calibration: Calibration) -> Iterator[str]:
     # the head is at the origin of a dome
-    distance = np.linalg.norm([light.position for light in dome.lights], axis=1)
+    distance = lengths([light.position for light in dome.lights])
     for light, ratio in zip(dome.lights, distance / np.median(distance), strict=True):
         # hidden by a white target
         if not 1 / DOUBTFUL_DISTANCE_RATIO <= ratio <= DOUBTFUL_DISTANCE_RATIO:

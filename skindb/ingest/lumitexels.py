@@ -53,6 +53,7 @@ from skindb.types import (
     Progress,
     Values16,
     silent,
+    unit,
 )
 
 T = TypeVar("T")
@@ -402,7 +403,7 @@ def choose_photographs(dome: DomeRecord, middle: Float64, count: int) -> list[Pa
 
     def directions(positions: list[Float64]) -> Float64:
         way = np.array(positions) - middle
-        return np.asarray(way / np.linalg.norm(way, axis=1, keepdims=True))
+        return unit(way)
 
     camera = directions([camera.centre for camera in dome.cameras])[:, 2].argmax()
     direction = directions([light.position for light in dome.lights])

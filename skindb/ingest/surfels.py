@@ -30,7 +30,7 @@ from skindb.geometry.mesh import (
     vertex_normals,
 )
 from skindb.geometry.rays import RayScene
-from skindb.types import Float32, Float64, Index, Mask, float64
+from skindb.types import Float32, Float64, Index, Mask, float64, lengths
 
 MAX_SURFELS = 2_500_000  # the samples of this many surfels in a full dome take 36 GB
 # mm; a landmark that is farther from the cropped than from the complete scan by this
@@ -69,7 +69,7 @@ class SurfelSet:
         """Cosine (n,) between normals and the direction to the camera."""
         way = camera.centre - self.position[part]
         cosine = np.einsum("ni,ni->n", way, self.normal[part])
-        return np.asarray(cosine / np.linalg.norm(way, axis=1))
+        return np.asarray(cosine / lengths(way))
 
     def spacing(self) -> float:
         """Distance [mm] of neighbours in an even lattice of the same density."""
@@ -228,7 +228,7 @@ def _site_position(
     points = surfels.position[member]
     area = surfels.area[member]
     middle = area @ points / area.sum()
-    return np.asarray(points[np.linalg.norm(points - middle, axis=1).argmin()])
+    return np.asarray(points[lengths(points - middle).argmin()])
 
 
 def _regions(

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skindb.types import Array, float64
+from skindb.types import Array, float64, lengths, unit
 
 
 def half_difference(
@@ -31,12 +31,12 @@ def half_difference(
         wi.shape,
     )
     h = wi + wo
-    h = h / np.maximum(np.linalg.norm(h, axis=-1, keepdims=True), 1e-12)
+    h = unit(h)
     # sines from cross products, because an arc cosine is too inaccurate for narrow lobes
     b = np.cross(n, h)
     t = np.cross(b, h)
-    sin_h = np.linalg.norm(b, axis=-1)
-    sin_d = np.linalg.norm(np.cross(h, wi), axis=-1)
+    sin_h = lengths(b)
+    sin_d = lengths(np.cross(h, wi))
     theta_h = np.arctan2(sin_h, np.maximum((n * h).sum(-1), 0.0))
     theta_d = np.arctan2(sin_d, np.maximum((h * wi).sum(-1), 0.0))
     phi = np.where(sin_h > 1e-7, np.arctan2((b * wi).sum(-1), (t * wi).sum(-1)), 0.0)

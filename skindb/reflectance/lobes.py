@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from skindb.optics.fresnel import fresnel_reflectance
-from skindb.types import Array
+from skindb.types import Array, unit
 
 # below it values continue, as tables have nodes below the horizon
 MIN_COSINE_LOBE = 1e-3
@@ -29,7 +29,7 @@ def evaluate_lobe(wi: Array, wo: Array, alpha: Array | float, index: float) -> A
     light = np.maximum(wi[..., 2], MIN_COSINE_LOBE)
     camera = np.maximum(wo[..., 2], MIN_COSINE_LOBE)
     half = wi + wo
-    half = half / np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-12)
+    half = unit(half)
     square = np.asarray(alpha) ** 2
     spread = square / (np.pi * (half[..., 2] ** 2 * (square - 1) + 1) ** 2)
     shadow = camera * np.sqrt(square + (1 - square) * light**2)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from skindb.reflectance.tables import directional_albedo
-from skindb.types import Array, Float32, Mask, float64
+from skindb.types import Array, Float32, Mask, float64, lengths, unit
 
 # fraction of directions drawn by the cosine alone, as tables have tails that do not
 # depend on the half vector
@@ -109,7 +109,7 @@ class TableSampler:
         cos_h = np.clip(np.einsum("nc,nc->n", half, normal), -1.0, 1.0)
         cos_d = np.einsum("nc,nc->n", half, view)
         # from the sine, because an arc cosine is too inaccurate for narrow lobes
-        theta = np.arctan2(np.linalg.norm(np.cross(half, normal), axis=1), cos_h)
+        theta = np.arctan2(lengths(np.cross(half, normal)), cos_h)
         u = np.sqrt(np.clip(theta / (np.pi / 2), 1e-12, 1.0))
         cells = self.density.shape[1]
         cell = np.minimum((u * cells).astype(np.int64), cells - 1)
@@ -153,9 +153,7 @@ def by_half_vector(
 def half_vectors(view: Array, towards: Array) -> Array:
     """Unit vectors (n, 3) half way between two directions."""
     half = towards + view
-    return np.asarray(
-        half / np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-12)
-    )
+    return unit(half)
 
 
 def tangents(normal: Array) -> tuple[Array, Array]:

@@ -15,7 +15,7 @@ from skindb.geometry.rays import RayScene
 from skindb.render.image import encode_srgb
 from skindb.schema import variables
 from skindb.schema.consent import honour_consent
-from skindb.types import Array, Faces, Float64, Index
+from skindb.types import Array, Faces, Float64, Index, lengths
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -287,7 +287,7 @@ def trace_front(
     corner = np.where(face[:, None] >= 0, triangle[face], -1)
     p, q, r = (position[corner[:, k]] for k in range(3))
     normal = np.cross(q - p, r - p)
-    shade = np.abs(normal @ back) / np.maximum(np.linalg.norm(normal, axis=1), 1e-30)
+    shade = np.abs(normal @ back) / np.maximum(lengths(normal), 1e-30)
     shape = (len(y), len(x))
     return (
         corner.reshape(*shape, 3),

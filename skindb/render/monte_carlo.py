@@ -26,7 +26,7 @@ from skindb.render.shading import (
     trace_view,
     transmitted_irradiance,
 )
-from skindb.types import Array, Float32, Index, Mask, Progress, float64
+from skindb.types import Array, Float32, Index, Mask, Progress, float64, lengths
 
 Image = Float32
 # rays per pixel and axis in one batch; random numbers are stratified over the rays of a
@@ -433,16 +433,12 @@ class LightChoice:
     def of_lights(cls, lights: Lights, centre: Array) -> LightChoice:
         """Probabilities for surfaces near `centre` (3,) [mm]."""
         towards = lights.position - centre
-        distance = np.linalg.norm(towards, axis=1)
+        distance = lengths(towards)
         axis = (np.arange(CELLS) + 0.5) * 2 / CELLS - 1
         normal = np.stack(
             np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1
         ).reshape(-1, 3)
-        cosine = (
-            normal
-            @ (towards / distance[:, None]).T
-            / np.linalg.norm(normal, axis=1, keepdims=True)
-        )
+        cosine = normal @ (towards / distance[:, None]).T / lengths(normal)[..., None]
         power = (
             lights.intensity.sum(axis=1)
             / distance**2

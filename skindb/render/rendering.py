@@ -42,7 +42,7 @@ from skindb.render.shading import (
 )
 from skindb.schema.consent import honour_consent
 from skindb.schema.notes import Omission
-from skindb.types import Float32, Mask, Progress
+from skindb.types import Float32, Mask, Progress, lengths
 
 UNITS = "radiance"  # in the unit of the photographs, or of the environment
 NO_LIGHTS = Lights(
@@ -165,7 +165,7 @@ def picture(shot: Shot) -> Float32:
 def frontal_camera(dome: xr.Dataset) -> int:
     """Index of the camera closest to the frontal direction (+z)."""
     place = dome["camera_position"].values
-    return int(np.argmax(place[:, 2] / np.linalg.norm(place, axis=1)))
+    return int(np.argmax(place[:, 2] / lengths(place)))
 
 
 def _index(names: list[str], name: str, device: str) -> int:

@@ -25,7 +25,7 @@ from skindb.reflectance.kinds import even_diffuse, surface_model
 from skindb.reflectance.model import ReflectanceModel
 from skindb.render.image import read_exr
 from skindb.schema import FitStatus, check, variables
-from skindb.types import AnyArray, Array, Faces, Index, Mask, float64
+from skindb.types import AnyArray, Array, Faces, Index, Mask, float64, lengths, unit
 
 NEEDED = (
     variables.SURFEL_POSITION,
@@ -295,9 +295,7 @@ def subdivide_surface(surface: Surface, spacing: float, visible: Mask) -> Surfac
     faces = np.asarray(surface.faces, np.int64)
     for _ in range(MAX_LEVELS):
         corners = vertices[faces]
-        longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(
-            axis=1
-        )
+        longest = lengths(corners - np.roll(corners, 1, axis=1)).max(axis=1)
         chosen = np.flatnonzero(
             (values["shown"][faces, 0] > 0).any(axis=1) & (longest > spacing)
         )
@@ -316,9 +314,7 @@ def subdivide_surface(surface: Surface, spacing: float, visible: Mask) -> Surfac
             vertices, faces, chosen, vertex_attributes=values
         )
     values.pop("shown")
-    values["normals"] = values["normals"] / np.maximum(
-        np.linalg.norm(values["normals"], axis=1, keepdims=True), 1e-12
-    )
+    values["normals"] = unit(values["normals"])
     arrays: dict[str, Any] = values
     return replace(surface, vertices=vertices, faces=faces, **arrays)
 

@@ -17,7 +17,7 @@ from skindb.optics.dipole_tree import subsurface_exitance
 from skindb.optics.fresnel import circular_reversal, fresnel_transmittance
 from skindb.reflectance.model import Lamp, Points
 from skindb.render.scene import Camera, Lights, Surface
-from skindb.types import Array, Float32, Index, Mask
+from skindb.types import Array, Float32, Index, Mask, lengths, unit
 
 DEFAULT_OPENING = 0.1  # of the octree
 # range of openings: below it, the tree takes longer than it saves; above it, pictures
@@ -403,9 +403,9 @@ def _facing_points(
     normal = np.einsum("nk,nkc->nc", weight, surface.normals[corners])
     position = np.einsum("nk,nkc->nc", weight, surface.vertices[corners])
     with np.errstate(invalid="ignore"):
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
+        normal = unit(normal)
         towards = camera.centre - position
-        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        towards = unit(towards)
         facing = (np.einsum("nc,nc->n", normal, towards) > 0) & (
             _facet_cosine(surface, corners, towards) > 0
         )
@@ -480,8 +480,8 @@ def polariser_factor(
     the camera, whose degrees of polarisation have this product.
     """
     towards = light - view.position
-    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    cosine = np.linalg.norm(towards + view.towards, axis=1) / 2  # of theta_d
+    towards = unit(towards)
+    cosine = lengths(towards + view.towards) / 2  # of theta_d
     return view.image(1 - polarisation * circular_reversal(cosine, eta)[:, None])
 
 

@@ -15,7 +15,7 @@ from skindb.reflectance.model import Lamp, Points, ReflectanceModel
 from skindb.render.scene import usable_surfels
 from skindb.schema import FitStatus, TexelStatus, Use, check, names_of, variables
 from skindb.schema.declaration import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
-from skindb.types import Array, Bytes, Float32, Index32, float64
+from skindb.types import Array, Bytes, Float32, Index32, float64, lengths
 
 Codes = Bytes
 STATUS = {FitStatus.FITTED: TexelStatus.MEASURED} | dict.fromkeys(
@@ -232,7 +232,7 @@ def reflectance_errors(
     """`evaluate_error` (n, 3) of n surfels for unit directions (n, 3), one of each."""
     eta = float(fitted[variables.REFRACTIVE_INDEX])
     normal = fitted[variables.SHADING_NORMAL].values.astype(np.float64)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal /= lengths(normal)[..., None]
     parameters = surface.parameters_of(fitted)
     none = np.zeros((len(normal), 0))
     points = Points(
@@ -271,14 +271,14 @@ def _to_measured(
     and phi_d stay. Where the half vector is the normal, it leaves the plane of incidence.
     """
     half = to_light + to_camera
-    half /= np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-12)
+    half /= np.maximum(lengths(half)[..., None], 1e-12)
     axis = np.cross(normal, half)
-    sine = np.linalg.norm(axis, axis=1, keepdims=True)
+    sine = lengths(axis)[..., None]
     across = to_light - to_camera
     tangent = tangent_frames(normal)[:, 0]
-    flat = np.linalg.norm(across, axis=1, keepdims=True) < 1e-6
+    flat = lengths(across)[..., None] < 1e-6
     axis = np.where(sine > 1e-6, axis, np.where(flat, tangent, across))
-    axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-12)
+    axis /= np.maximum(lengths(axis)[..., None], 1e-12)
     angle = np.arctan2(sine[:, 0], np.einsum("nc,nc->n", normal, half))
     seen = np.radians(fitted[variables.SMALLEST_HALF_ANGLE].values.astype(np.float64))
     return Rotation.from_rotvec(np.maximum(seen - angle, 0.0)[:, None] * axis)
@@ -340,7 +340,7 @@ def _unit(name: str, direction: ArrayLike) -> Array:
             f"the shape {vectors.shape}",
             "put x, y, z last",
         )
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    length = lengths(vectors)[..., None]
     if not (np.abs(length - 1) < MAX_LENGTH_ERROR).all():
         worst = length.flat[
             np.argmax(np.where(np.isfinite(length), np.abs(length - 1), np.inf))

@@ -25,7 +25,7 @@ from skindb.render.surfels import surfel_confidence, with_matt_surfels
 from skindb.schema import variables
 from skindb.schema.consent import honour_consent
 from skindb.schema.notes import Omission
-from skindb.types import AnyArray, Array, Faces, Float32, Half, float64
+from skindb.types import AnyArray, Array, Faces, Float32, Half, float64, lengths
 
 COUNT = 256  # lights, in 64 passes of four
 SKY_ROWS = 32  # rows of the image of the default sky
@@ -136,7 +136,7 @@ def distant_lights(environment: Environment, count: int = COUNT) -> DistantLight
             for a, b, c, d in lit
         ]
     )
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    direction /= lengths(direction)[..., None]
     irradiance = np.array([energy[a:b, c:d].sum(axis=(0, 1)) for a, b, c, d in lit])
     # so that the first lights already come from all directions
     order = np.random.default_rng(0).permutation(len(lit))
@@ -400,11 +400,7 @@ def _about(
     dome = model["dome"].to_dataset().load()
     corners = surface.vertices[np.unique(surface.faces)]
     centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
-    distance = float(
-        np.median(
-            np.linalg.norm(dome[variables.LIGHT_POSITION].values - centre, axis=1)
-        )
-    )
+    distance = float(np.median(lengths(dome[variables.LIGHT_POSITION].values - centre)))
     intensity = np.median(dome[variables.LIGHT_INTENSITY].values, axis=0)
     translucent = (
         surface.s is not None
@@ -415,7 +411,7 @@ def _about(
     return {
         "eta": surface.eta,
         "centre": centre.tolist(),
-        "radius": float(np.linalg.norm(corners - centre, axis=1).max()),
+        "radius": float(lengths(corners - centre).max()),
         "lightDistance": distance,
         "lightIntensity": intensity.tolist(),
         "exposure": float(np.pi * distance**2 / intensity.mean()),
@@ -441,11 +437,7 @@ def _surroundings(
     )
     dome = model["dome"].to_dataset().load()
     middle = model["fitted"].to_dataset()[variables.SURFEL_POSITION].values.mean(axis=0)
-    distance = float(
-        np.median(
-            np.linalg.norm(dome[variables.LIGHT_POSITION].values - middle, axis=1)
-        )
-    )
+    distance = float(np.median(lengths(dome[variables.LIGHT_POSITION].values - middle)))
     unit = (
         float(np.median(dome[variables.LIGHT_INTENSITY].values, axis=0).mean())
         / distance**2

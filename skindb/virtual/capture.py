@@ -30,7 +30,7 @@ from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.tables import directional_albedo
 from skindb.render.scene import Surface
 from skindb.schema import FitStatus, variables
-from skindb.types import Array, Float64, Mask, Progress
+from skindb.types import Array, Float64, Mask, Progress, lengths
 from skindb.virtual.dome import (
     CENTRE,
     DARK,
@@ -512,7 +512,7 @@ def recovered_against_true(model: xr.DataTree, truth: Mapping[str, Array]) -> Re
     face, corner = foot_points(fitted, truth)
     corners = truth["faces"][np.maximum(face, 0)]
     normal = at_foot_points(truth["normals"][corners], corner)
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    length = lengths(normal)[..., None]
     normal = np.divide(
         normal, length, out=np.full_like(normal, np.nan), where=length > 0
     )

@@ -18,7 +18,7 @@ from skindb.geometry.rays import RayScene
 from skindb.parameters import require_sizes
 from skindb.render.scene import Camera, Lights, Surface
 from skindb.render.shading import exitances, polariser_factor, shade_view, trace_view
-from skindb.types import Float32, Float64, Values16
+from skindb.types import Float32, Float64, Values16, lengths, unit
 
 CENTRE = np.array([0.0, -8.0, 45.0])  # of the dome in the subject frame, mm
 # mm
@@ -126,7 +126,7 @@ def build_dome(
     lamps = _spiral(lights, np.radians(FRONT), turn=0.0)
     eyes = _spiral(cameras, np.radians(60.0), turn=0.7)
     eyes[:, 1] *= 0.7  # concentrated around the head rather than above and below it
-    eyes /= np.linalg.norm(eyes, axis=1, keepdims=True)
+    eyes = unit(eyes)
     dome = Dome(
         tuple(
             _camera(i, e, width, height, rng) for i, e in enumerate(_apart(eyes, lamps))
@@ -195,7 +195,7 @@ def _camera(
     )
     # half extents of the framed ellipsoid as this camera sees it (small-angle: the head
     # is a tenth of the distance)
-    extent = np.linalg.norm(rotation[:2] * HEAD, axis=1) / np.linalg.norm(eye - CENTRE)
+    extent = lengths(rotation[:2] * HEAD) / np.linalg.norm(eye - CENTRE)
     focal = 0.97 * min(width / (2 * extent[0]), height / (2 * extent[1]))
     k = np.array(
         [

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from skindb.types import Float64, float64
+from skindb.types import Float64, float64, unit
 
 STEP = 0.02  # mm, of the central differences that give the normal
 REGIONS = (
@@ -81,7 +81,7 @@ def normals(points: Float64, shape: FaceShape) -> Float64:
     slope = np.stack(
         [field(points + d, shape) - field(points - d, shape) for d in step], axis=1
     )
-    return np.asarray(slope / np.linalg.norm(slope, axis=1, keepdims=True))
+    return unit(slope)
 
 
 def _ellipsoid(

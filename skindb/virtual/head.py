@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
-from skindb.types import Float64, Index, Mask
+from skindb.types import Float64, Index, Mask, lengths
 from skindb.virtual.face import (
     STEP,
     FaceShape,
@@ -176,9 +176,7 @@ def _settle(points: Float64, shape: FaceShape) -> Float64:
             )
             / STEP
         )
-        steepness = np.maximum(
-            np.linalg.norm(slope, axis=1, keepdims=True), LEAST_SLOPE
-        )
+        steepness = np.maximum(lengths(slope)[..., None], LEAST_SLOPE)
         # mm: the range in which the slope is valid
         step = np.clip(value[far, None] / steepness, -0.5, 0.5)
         points[far] = near - step * slope / steepness

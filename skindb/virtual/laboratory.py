@@ -17,7 +17,7 @@ import numpy as np
 
 from skindb.clock import Clock, SimulatedClock
 from skindb.errors import input_error
-from skindb.types import Float64, Index, float64
+from skindb.types import Float64, Index, float64, lengths
 from skindb.virtual.devices import (
     GAUGE_FAULTS,
     DeviceFaults,
@@ -185,9 +185,7 @@ class Laboratory:
         places = np.array(
             [light["position"] for light in self._record["lights"]], np.float64
         )
-        nearest = np.argsort(-places @ centre / np.linalg.norm(places, axis=1))[
-            :LAMP_LIGHTS
-        ]
+        nearest = np.argsort(-places @ centre / lengths(places))[:LAMP_LIGHTS]
         names = [str(self._record["lights"][i]["id"]) for i in nearest]
         frames = {name: _read(self._required(camera, exposure, name)) for name in names}
         return max(

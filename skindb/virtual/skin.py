@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from skindb.files import package_json
 from skindb.optics.diffusion import dipole_s, scattering_coefficients
-from skindb.types import Float64, float64
+from skindb.types import Float64, float64, lengths
 from skindb.virtual.head import Head
 from skindb.virtual.person import Person
 
@@ -35,7 +35,7 @@ def smooth_noise(
     """
     vector = rng.standard_normal((WAVES, 3))
     number = 2 * np.pi / (wavelength * rng.uniform(0.7, 1.4, WAVES))
-    vector *= (number / np.linalg.norm(vector, axis=1))[:, None]
+    vector *= (number / lengths(vector))[:, None]
     phase = rng.uniform(0, 2 * np.pi, WAVES)
     # float32 is sufficient, and 40 cosines per vertex dominate the cost of a skin
     wave = np.cos(

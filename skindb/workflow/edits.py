@@ -21,7 +21,7 @@ from skindb.render.rendering import frontal_camera, radiance_of
 from skindb.schema import variables
 from skindb.schema.consent import require_consent
 from skindb.store import STUDY, Database, Record, require_fresh
-from skindb.types import Float32, Progress, silent
+from skindb.types import Float32, Progress, lengths, silent
 from skindb.workflow import studies
 from skindb.workflow.audit import logged
 from skindb.workflow.cohorts import current_registrations, registered_datasets
@@ -242,7 +242,7 @@ def _frontal_light(model: xr.DataTree) -> str:
     dome = model["dome"].to_dataset().load()
     seen_from = dome[variables.CAMERA_POSITION].values[frontal_camera(dome)]
     place = dome[variables.LIGHT_POSITION].values
-    cosine = place @ seen_from / np.linalg.norm(place, axis=1)
+    cosine = place @ seen_from / lengths(place)
     return str(dome["light"].values[int(np.argmax(cosine))])
 
 
