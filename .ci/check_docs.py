@@ -215,17 +215,27 @@ def link_faults(page: Path, text: str) -> Iterator[str]:
 
 
 def figure_faults(where: str, text: str) -> Iterator[str]:
-    """Sections of results that show figures but no command."""
+    """Sections of results that show figures but no command.
+
+    The command of a section before its first subsection applies to all of them; otherwise
+    each subsection needs its own.
+    """
     for section in re.split(r"^(?=## )", text, flags=re.M)[1:]:
-        title = section.splitlines()[0]
-        figures = re.search(r"\d", CODE.sub(blank, section.partition("\n")[2]))
-        called = any(
-            words[0] in {"skindb", "python", "pytest"}
-            for _, words in commands(section)
-            if words
-        )
-        if figures and not called:
-            yield f"{where}: the section {title!r} has figures, but no command that reproduces them"
+        start, *subsections = re.split(r"^(?=### )", section, flags=re.M)
+        for part in [start] if _has_command(start) else [start, *subsections]:
+            title = part.splitlines()[0]
+            figures = re.search(r"\d", CODE.sub(blank, part.partition("\n")[2]))
+            if figures and not _has_command(part):
+                fault = "has figures, but no command that reproduces them"
+                yield f"{where}: the section {title!r} {fault}"
+
+
+def _has_command(part: str) -> bool:
+    return any(
+        words[0] in {"skindb", "python", "pytest"}
+        for _, words in commands(part)
+        if words
+    )
 
 
 def main() -> int:

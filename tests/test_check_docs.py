@@ -94,6 +94,16 @@ def test_figure_faults__requires_a_command_in_every_section_with_figures():
     assert "'## Bad'" in fault
 
 
+def test_figure_faults__lets_subsections_inherit_the_command_before_them_only():
+    command = "```bash\nskindb bench\n```\n\n"
+    page = f"# Results\n\n## Good\n\n{command}### First\n\n1 s\n\n"
+    page += (
+        f"## Parts\n\nText.\n\n### Good part\n\n{command}2 s\n\n### Bad part\n\n3 s\n"
+    )
+    (fault,) = check_docs.figure_faults("page", page)
+    assert "'### Bad part'" in fault
+
+
 def test_link_faults__names_files_that_do_not_exist():
     page = check_docs.ROOT / "README.md"
     text = (
