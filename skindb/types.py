@@ -53,6 +53,16 @@ def float64(values: ArrayLike) -> Float64:
     return np.asarray(values, np.float64)
 
 
+def finite_rows(values: AnyArray) -> Mask:
+    """Mask (...) of the rows of an array (..., d) whose values are all finite."""
+    return np.asarray(np.isfinite(values).all(axis=-1))
+
+
+def dots(a: AnyArray, b: AnyArray) -> AnyArray:
+    """Products (n,) of the vectors of arrays (n, d)."""
+    return np.asarray(np.einsum("nc,nc->n", a, b))
+
+
 def lengths(vectors: ArrayLike) -> AnyArray:
     """Lengths (...) of vectors (..., d)."""
     return np.asarray(np.linalg.norm(vectors, axis=-1))

@@ -30,7 +30,7 @@ from skindb.parameters import group_option
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.label import FACE
-from skindb.types import Array, Mask
+from skindb.types import Array, Mask, finite_rows
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -141,7 +141,7 @@ def _colours(take: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
     """Sampled surfels of one take of a cohort, with the regions of its capture or those
     defined by landmarks.
     """
-    good = np.isfinite(take[variables.DIFFUSE_REFLECTANCE].values).all(axis=-1) & (
+    good = finite_rows(take[variables.DIFFUSE_REFLECTANCE].values) & (
         take[variables.SURFEL_AREA].values > 0
     )
     if not good.any():

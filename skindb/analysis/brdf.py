@@ -36,7 +36,7 @@ from skindb.reflectance.reduction import Systems, factor_reflectance, residuals
 from skindb.reflectance.tables import TableGrid, brdf_metric
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
-from skindb.types import Array, Float32, Half, Index, unit
+from skindb.types import Array, Float32, Half, Index, dots, finite_rows, unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -184,7 +184,7 @@ def _mean(take: xr.Dataset) -> Array:
     """Area-weighted mean (m,) of the weights (n, m) of one take."""
     weights = take[variables.DICTIONARY_WEIGHT].values
     area = take[variables.SURFEL_AREA].values
-    good = np.isfinite(weights).all(axis=1)
+    good = finite_rows(weights)
     return np.asarray(
         np.average(
             weights[good].astype(float),
@@ -204,7 +204,7 @@ def _fitted_weights(take: xr.Dataset) -> Array:
     is padded with NaN.
     """
     weights = take[variables.DICTIONARY_WEIGHT].values
-    return np.asarray(weights[np.isfinite(weights).all(axis=1)].astype(float))
+    return np.asarray(weights[finite_rows(weights)].astype(float))
 
 
 def project(weights: Array, H: Array, metric: Array) -> Array:
@@ -482,7 +482,7 @@ def _take_errors(take: xr.Dataset, tables: Array, bases: Sequence[Array]) -> Arr
 
 def _systems(take: xr.Dataset, tables: Array, part: slice) -> Systems:
     """Normal equations of the selected surfels of one take."""
-    is_fitted = np.isfinite(take[variables.DIFFUSE_REFLECTANCE].values).all(axis=1)
+    is_fitted = finite_rows(take[variables.DIFFUSE_REFLECTANCE].values)
     surfels = take.isel(surfel=np.flatnonzero(is_fitted)[part])
     eta = float(take["fit_eta"]) if "fit_eta" in take else np.nan
     # for models that do not state the parameters of their fit
@@ -523,11 +523,11 @@ def _surface_rows(
         normal,
         to_light,
         to_camera,
-        np.asarray(np.isfinite(values).all(axis=-1)),
+        finite_rows(values),
     )
     surfel = np.repeat(np.arange(len(position)), np.diff(offsets))
-    cos_i = np.einsum("nc,nc->n", normal[surfel], to_light[surfel, index[:, 0]])
-    cos_o = np.einsum("nc,nc->n", normal[surfel], to_camera[surfel, index[:, 1]])
+    cos_i = dots(normal[surfel], to_light[surfel, index[:, 0]])
+    cos_o = dots(normal[surfel], to_camera[surfel, index[:, 1]])
     passed = (
         cos_i
         * fresnel_transmittance(cos_i, eta)

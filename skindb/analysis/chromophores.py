@@ -42,7 +42,7 @@ from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.label import FACE
 from skindb.schema.notes import note
-from skindb.types import Array, Mask, lengths
+from skindb.types import Array, Mask, finite_rows, lengths
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -384,9 +384,7 @@ def chromophore_table(
 def _density(maps: xr.Dataset) -> tuple[Array, Mask]:
     """-ln R_d (v, u, 3), 0 where nothing was measured, and the mask (v, u) of measured texels."""
     albedo = maps[variables.TEXEL_DIFFUSE_REFLECTANCE].values.astype(float)
-    measured = (maps[variables.TEXEL_COVERAGE].values > COVERED) & np.isfinite(
-        albedo
-    ).all(axis=-1)
+    measured = (maps[variables.TEXEL_COVERAGE].values > COVERED) & finite_rows(albedo)
     return -np.log(
         np.maximum(np.where(measured[..., None], albedo, 1.0), DARKEST)
     ), measured

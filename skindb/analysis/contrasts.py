@@ -41,7 +41,7 @@ from skindb.numerics.inference import (
 from skindb.numerics.statistics import known_mean
 from skindb.parameters import ContrastParameters
 from skindb.schema import IDENTIFIED, variables
-from skindb.types import Array, Index, Mask, float64
+from skindb.types import Array, Index, Mask, finite_rows, float64
 
 Result = TypeVar("Result")
 CHANNELS = ("R", "G", "B")
@@ -193,7 +193,7 @@ class Contrast:
 
     def complete(self) -> Contrast:
         """The contrast of the subjects with known regressor and covariates."""
-        rows = np.isfinite(self.regressor) & np.isfinite(self.covariates).all(axis=1)
+        rows = np.isfinite(self.regressor) & finite_rows(self.covariates)
         return replace(
             self,
             quantities=self.quantities.of_takes(rows),
@@ -434,7 +434,7 @@ def _association(contrast: Contrast, subjects: Subjects, name: str) -> float:
     if attribute.odd_words:
         return float("nan")
     columns = attribute.columns
-    is_known = np.isfinite(columns).all(axis=1)
+    is_known = finite_rows(columns)
     if not is_known.any():
         return float("nan")
     return multiple_correlation(contrast.regressor[is_known], columns[is_known])

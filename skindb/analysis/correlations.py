@@ -27,7 +27,7 @@ from skindb.parameters import permutations_option, seed_option
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit, require_takes
 from skindb.schema.label import FACE
-from skindb.types import Array
+from skindb.types import Array, finite_rows
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -173,7 +173,7 @@ def _require_region(takes: xr.Dataset, region: str) -> None:
 
 def _can_correlate(columns: Array) -> bool:
     """Whether enough subjects have both columns (n, 2), and both vary between them."""
-    complete = columns[np.isfinite(columns).all(axis=1)]
+    complete = columns[finite_rows(columns)]
     return len(complete) >= MIN_SUBJECTS and bool((np.ptp(complete, axis=0) > 0).all())
 
 
@@ -181,7 +181,7 @@ def _pair(
     two: Array, permutations: int, rng: np.random.Generator
 ) -> tuple[float, float, float, float, int]:
     """Correlation, ends of its interval, p value and number of subjects of two columns."""
-    x, y = two[np.isfinite(two).all(axis=1)].T
+    x, y = two[finite_rows(two)].T
     # pairs of subjects are drawn anew; all of them are used if there are at most `permutations`
     p = stats.permutation_test(
         (x,),

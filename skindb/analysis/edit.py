@@ -18,7 +18,7 @@ from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, store
 from skindb.schema import GROUPS, Use, check, dataset, label, names_of, variables
 from skindb.schema.consent import honour_consent
 from skindb.schema.label import FACE, take_attrs
-from skindb.types import Array, Mask, float64
+from skindb.types import Array, Mask, finite_rows, float64
 
 Report = dict[str, Any]
 # limits of an edited albedo
@@ -197,7 +197,7 @@ def _moved_surface(
     (component,) by the shift.
     """
     weights = fitted[variables.DICTIONARY_WEIGHT].values.astype(float)
-    good = np.isfinite(weights).all(axis=1)
+    good = finite_rows(weights)
     area = fitted[variables.SURFEL_AREA].values[good].astype(float)
     H = basis[variables.POPULATION_MIXTURE].values.astype(float)
     here = project(weights[good], H, metric)
@@ -243,7 +243,7 @@ def with_basis(
     fitted = model["fitted"].to_dataset().load()
     tree = model.copy()
     weights = fitted[variables.DICTIONARY_WEIGHT].values.astype(float)
-    good = np.isfinite(weights).all(axis=1)
+    good = finite_rows(weights)
     coefficients = np.full((len(weights), len(mixture)), np.nan)
     coefficients[good] = project(weights[good], float64(mixture), brdf_metric(tables))
     rest = fitted.drop_dims("component")  # the components of another basis differ
@@ -332,7 +332,7 @@ def _moved_texture(
         np.nan_to_num(shift[region, :, 0]).mean(axis=-1)
         @ np.linalg.inv(texture[variables.TEXTURE_COLOUR_AXIS].values).T
     )
-    good = np.isfinite(colour).all(axis=1)
+    good = finite_rows(colour)
     mean = np.average(
         colour[good], axis=0, weights=fitted[variables.SURFEL_AREA].values[good]
     )
@@ -360,7 +360,7 @@ def _with_albedo(
         version[variables.DIFFUSE_REFLECTANCE].values.astype(float)
         for version in (fitted, moved)
     )
-    good = np.isfinite(colour).all(axis=1)
+    good = finite_rows(colour)
     area = fitted[variables.SURFEL_AREA].values[good].astype(float)
     before, now = (np.average(x[good], axis=0, weights=area) for x in (colour, out))
     face = albedo["region"].values.tolist().index(FACE)
@@ -382,7 +382,7 @@ def _moved_albedo(
 ) -> tuple[xr.Dataset, Report, float]:
     """Shift the quantiles of albedo by the shift of the whole face."""
     colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(float)
-    good = np.isfinite(colour).all(axis=1)
+    good = finite_rows(colour)
     mean, axes, edges = (
         albedo[n].values
         for n in (
@@ -423,11 +423,11 @@ def _moved_sigma_tr(
     log, is_measured = _log_shift(amount, traits)
     before = np.log(fitted[variables.SIGMA_TR].values.astype(float))
     after = np.clip(before + log, *np.log(SIGMA_TR_RANGE))
-    good = np.isfinite(before).all(axis=1)
+    good = finite_rows(before)
     area = fitted[variables.SURFEL_AREA].values[good].astype(float)
     mean, now = (np.average(x[good], axis=0, weights=area) for x in (before, after))
     population = traits[variables.TAKE_LOG_SIGMA_TR]
-    measured = np.isfinite(population.values).all(axis=1)
+    measured = finite_rows(population.values)
     names = [str(t) for t in population["take"].values[measured]]
     distance, move = _distances(
         now, mean, population.values[measured], names, np.eye(3)
@@ -485,7 +485,7 @@ def _log_shift(amount: Array, traits: xr.Dataset) -> tuple[Array, Mask]:
     measured shift.
     """
     shifts = traits[variables.TRAIT_LOG_SIGMA_TR_SHIFT].values
-    is_measured = np.isfinite(shifts).all(axis=1)
+    is_measured = finite_rows(shifts)
     return np.asarray(amount[is_measured] @ shifts[is_measured]), is_measured
 
 

@@ -34,7 +34,7 @@ from skindb.errors import Fault, InputError, input_error
 from skindb.parameters import ContrastParameters, permutations_option
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit, require_takes
-from skindb.types import Array
+from skindb.types import Array, finite_rows
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -244,7 +244,7 @@ def _block_means(take: xr.Dataset, variable: str, size: int) -> Array:
     values = values.reshape(*values.shape[:2], -1)
     if variable.endswith(LOGARITHMIC):
         values = np.log(np.where(values > 0, values, np.nan))
-    is_known = np.isfinite(values).all(axis=-1)
+    is_known = finite_rows(values)
     weight = np.where(is_known, take[variables.TEXEL_COVERAGE].values, 0.0)[..., None]
     block = len(values) // size
     shape = (size, block, size, block, -1)

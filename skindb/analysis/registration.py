@@ -27,7 +27,7 @@ from skindb.geometry.warp import (
 from skindb.schema import dataset, variables
 from skindb.schema.consent import honour_consent
 from skindb.schema.notes import Note, note
-from skindb.types import Array, Float64, Index, float64, lengths
+from skindb.types import Array, Float64, Index, finite_rows, float64, lengths
 
 Takes = Mapping[str, xr.DataTree]
 Registered = Mapping[str, xr.Dataset]
@@ -221,9 +221,7 @@ def _template_take(outlines: Mapping[str, Outline], target: Array) -> str:
 
     Among several, it is the one that shows most of its head, of those with many landmarks.
     """
-    has_landmark = {
-        take: np.isfinite(row.landmark).all(axis=1) for take, row in outlines.items()
-    }
+    has_landmark = {take: finite_rows(row.landmark) for take, row in outlines.items()}
     sound = [take for take in outlines if outlines[take].alignable] or [*outlines]
     served = {
         take: sum(
@@ -281,7 +279,7 @@ def _mm_per_uv(landmark: Array, target: Array) -> float:
     """Ratio of the spread of landmarks (k, 3) in mm to their spread (k, 2) in common
     (u, v); NaN for fewer than 2.
     """
-    is_known = np.isfinite(landmark).all(axis=1) & np.isfinite(target).all(axis=1)
+    is_known = finite_rows(landmark) & finite_rows(target)
     if is_known.sum() < 2:
         return float("nan")
     face, flat = (
@@ -298,7 +296,7 @@ def has_landmarks(model: xr.DataTree) -> bool:
         or variables.LANDMARK_POSITION not in model["mesh"].data_vars
     ):
         return False
-    return bool(np.isfinite(_landmarks_mm(model)).all(axis=1).any())
+    return bool(finite_rows(_landmarks_mm(model)).any())
 
 
 def _registration_dataset(

@@ -18,7 +18,7 @@ from skindb.schema.consent import consent_scope
 from skindb.schema.declaration import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
 from skindb.schema.label import FACE
 from skindb.schema.notes import note
-from skindb.types import AnyArray, Array, Index, Mask
+from skindb.types import AnyArray, Array, Index, Mask, finite_rows
 
 # surfels per take; the paper drew 2,000 of each subject, and 5,000 for the conditions
 # of one subject
@@ -183,9 +183,7 @@ def trusted_surfels(fitted: xr.Dataset) -> Mask:
     if variables.FIT_SAMPLES in fitted:
         enough = fitted[variables.FIT_SAMPLES].values >= MIN_SAMPLES_TRUSTED
         good &= enough | ~(good & enough).any()
-    return np.asarray(
-        good & np.isfinite(fitted[variables.DIFFUSE_REFLECTANCE].values).all(axis=1)
-    )
+    return np.asarray(good & finite_rows(fitted[variables.DIFFUSE_REFLECTANCE].values))
 
 
 def no_surfels_error(model: xr.DataTree) -> InputError:
@@ -216,7 +214,7 @@ def _basis_tables(model: xr.DataTree, fitted: xr.Dataset) -> xr.Dataset:
     eta = eta.reset_coords(drop=True)
     if variables.BASIS_WEIGHT not in fitted:
         return xr.merge([tables, eta])
-    good = np.isfinite(fitted[variables.BASIS_WEIGHT].values).all(axis=1) & (
+    good = finite_rows(fitted[variables.BASIS_WEIGHT].values) & (
         fitted[variables.FIT_STATUS].values == FitStatus.FITTED
     )
     area = fitted[variables.SURFEL_AREA].values[good].astype(float)
@@ -418,9 +416,9 @@ def common_maps(
         if name not in fitted or not (needed or name == variables.DIFFUSE_REFLECTANCE):
             continue
         values = fitted[name].values.reshape(len(codes), -1).astype(np.float32)
-        trust = (
-            (codes == TexelStatus.MEASURED) & np.isfinite(values).all(axis=1)
-        ).astype(np.float32)
+        trust = ((codes == TexelStatus.MEASURED) & finite_rows(values)).astype(
+            np.float32
+        )
         image, weight = atlas_values(
             np.nan_to_num(values), trust, uv, triangles, raster
         )

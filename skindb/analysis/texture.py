@@ -32,7 +32,7 @@ from skindb.numerics.texture import (
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.label import FACE
-from skindb.types import Array, Index, Mask
+from skindb.types import Array, Index, Mask, finite_rows
 
 SIZE = 1024  # texels along each side
 REGIONS = (FACE, "beard", "no_beard")
@@ -384,14 +384,13 @@ def _distances(
         texture[variables.TEXTURE_QUANTILE].values[:, matched].astype(float)
     )
     quantiles_of_takes = quantiles_of_takes.reshape(len(quantiles_of_takes), -1)
-    rows = quantiles_of_takes[
-        np.isfinite(quantiles_of_takes).all(axis=1)
-    ]  # takes with all of these regions
+    # takes with all of these regions
+    rows = quantiles_of_takes[finite_rows(quantiles_of_takes)]
     after, before = (values.reshape(-1) for values in quantiles[::-1])
     usable = np.isfinite(before) & np.isfinite(after)
     if len(rows) < MIN_TAKES_DISTANCE or not usable.any():
         return None, None
-    principal = principal_axes(rows[:, usable], len(rows) - 1)
+    principal = principal_axes([*rows[:, usable]], len(rows) - 1)
     fraction = np.cumsum(principal.variance) / max(principal.total, 1e-300)
     count = int(np.searchsorted(fraction, KEPT_VARIANCE)) + 1
     axes = principal.axes[:count]

@@ -42,7 +42,7 @@ from skindb.parameters import DICTIONARY_HELP, adjust_option, option, seed_optio
 from skindb.schema import IDENTIFIED, dataset, variables
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.label import FACE
-from skindb.types import Array, Mask, float64
+from skindb.types import Array, Mask, finite_rows, float64
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -321,7 +321,7 @@ def _units(
     names = [s for s, _, _ in whose]
     held = [subjects.by_subject(name, names).columns for name in adjust]
     design = np.column_stack([[x for _, x, _ in whose], np.ones(len(whose)), *held])
-    complete = np.isfinite(design).all(axis=1)
+    complete = finite_rows(design)
     design = design[complete]
     if np.linalg.matrix_rank(design) < np.linalg.matrix_rank(design[:, 1:]) + 1:
         finding = ", ".join(adjust) or "one value"

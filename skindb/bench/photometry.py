@@ -20,7 +20,7 @@ from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.mixture import basis_rows
 from skindb.reflectance.separation import surface_lobes
 from skindb.schema import dataset, label, variables
-from skindb.types import Array, Mask, Values16
+from skindb.types import Array, Mask, Values16, dots
 from skindb.virtual.dome import Sensor
 
 ETA = 1.3
@@ -87,7 +87,7 @@ def model_samples(
     ci = lit.clip(0, 1)
     transmitted = fresnel_transmittance(seen.clip(0, 1), ETA)
     body = (lit * fresnel_transmittance(ci, ETA))[s, i] * transmitted[s, o]
-    surface = np.einsum("tm,tm->t", rows, weight[s])
+    surface = dots(rows, weight[s])
     value = body[:, None] / np.pi * diffuse[s] + surface[:, None]
     scatter = np.hypot(noise * value, floor) * rng.normal(size=value.shape)
     sample = np.full((surfels, lights, cameras, 3), np.nan)
@@ -182,7 +182,7 @@ def _normals(skin: ModelSamples, method: str, samples: str) -> Point:
 
 def _angles(normal: Array, true: Array) -> Array:
     """Angles (n,) between normals [degree]."""
-    cosine = np.einsum("nk,nk->n", normal, true).clip(-1, 1)
+    cosine = dots(normal, true).clip(-1, 1)
     return np.asarray(np.degrees(np.arccos(cosine)))
 
 

@@ -28,7 +28,7 @@ from skindb.reflectance.mixture import Mixture, basis_rows
 from skindb.reflectance.model import Block, Comparison, Judgement, SurfaceFit
 from skindb.reflectance.reduction import reduce_dictionary
 from skindb.reflectance.tables import brdf_metric, lookup
-from skindb.types import Array, lengths
+from skindb.types import Array, dots, lengths
 
 ETA = 1.3
 DISC = float(np.radians(0.8))
@@ -132,7 +132,7 @@ def strip(
     transmitted = fresnel_transmittance(c, ETA)
     transmitted = c * transmitted * fresnel_transmittance(co[surfel, o], ETA)
     scattered = (transmitted / np.pi)[:, None] * diffuse[surfel]
-    true = np.einsum("tm,tm->t", rows, weight[surfel])
+    true = dots(rows, weight[surfel])
     value = true[:, None] + scattered
     value *= 1 + noise * rng.normal(size=value.shape)
     sample = np.full((surfels, 150, 16, 3), np.nan, np.float16)

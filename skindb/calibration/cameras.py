@@ -39,7 +39,7 @@ from skindb.format.dome import (
     Pinhole,
 )
 from skindb.schema import GROUPS, dataset
-from skindb.types import Float32, Float64, float64, lengths
+from skindb.types import Float32, Float64, finite_rows, float64, lengths
 
 # the manufacturer's reference values, as in colour-science
 CHART = "ColorChecker24 - After November 2014"
@@ -124,7 +124,7 @@ def fit_colour_matrix(patches: ArrayLike) -> ColourFit:
         f"{values.shape} and {target.shape}",
         "give the patches row by row",
     )
-    good = np.asarray(np.isfinite(values).all(axis=1))
+    good = finite_rows(values)
     white = int(target.sum(axis=1).argmax())
     usable = good.sum() >= MIN_PATCHES and good[white] and values[white, 1] > 0
     require(

@@ -16,7 +16,7 @@ from skindb.errors import attempt_all, require
 from skindb.format.dome import CameraRecord, DomeRecord, LightRecord, WhiteRecord
 from skindb.format.frames import Digests
 from skindb.numerics.statistics import robust_deviation
-from skindb.types import Float64, Index, Mask, float64, lengths
+from skindb.types import Float64, Index, Mask, dots, finite_rows, float64, lengths
 
 # of the half size: a disc inside the square, however the square is rotated
 TARGET_INTERIOR_FRACTION = 0.8
@@ -46,7 +46,7 @@ def light_falloff(light: LightRecord, points: Float64) -> tuple[Float64, Float64
     (n,) towards them.
     """
     way = points - light.position
-    square = np.einsum("ni,ni->n", way, way)
+    square = dots(way, way)
     if light.falloff == 0:
         return square, np.ones(len(points))
     cosine = np.maximum(way @ light.axis, 0.0) / np.sqrt(square)
@@ -163,7 +163,7 @@ def _target_rows(
 
 def robust_mean(values: Float64) -> Float64:
     """Mean (c,) of values (n, c) without outliers; NaN if there are too few values."""
-    usable = values[np.isfinite(values).all(axis=1)]
+    usable = values[finite_rows(values)]
     if len(usable) < MIN_TARGET_PIXELS:
         return np.full(values.shape[1], np.nan)
     columns = np.ascontiguousarray(usable.T)  # medians are taken along rows
@@ -326,7 +326,7 @@ def fit_light(target: TargetPixels, *, falloff: float | None = None) -> LightFit
         factor = distance**2 / (target.reflectance * lit)
         value = np.log(np.pi * radiance * factor[:, None])
         slope = np.log(angle)
-    good = (lit > MIN_COSINE) & (angle > MIN_COSINE) & np.isfinite(value).all(axis=1)
+    good = (lit > MIN_COSINE) & (angle > MIN_COSINE) & finite_rows(value)
     require(
         good.sum() >= MIN_PIXELS,
         "white target",

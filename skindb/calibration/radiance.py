@@ -23,7 +23,7 @@ from skindb.format.dome import CameraRecord, DomeRecord
 from skindb.format.frames import Digests, Frame, filled, read_frames
 from skindb.format.sensor import SensorRecord
 from skindb.jit import sample_bits
-from skindb.types import Bytes, Float32, Float64, Index, Mask, float64
+from skindb.types import Bytes, Float32, Float64, Index, Mask, finite_rows, float64
 
 # number of radiances up to the white level at which the linear model is fitted to the
 # variance
@@ -285,7 +285,7 @@ def radiance_floor(sensor: SensorRecord, exposures: Mapping[str, float]) -> floa
 
 def _linear(frames: list[Frame]) -> tuple[Image, Image, Bytes]:
     radiance = _only(frames).astype(np.float32)
-    lost = ~np.isfinite(radiance).all(axis=-1)
+    lost = ~finite_rows(radiance)
     radiance[lost] = np.nan
     flag = np.where(lost, SATURATED, OK).astype(np.uint8)
     return radiance, np.zeros_like(radiance), flag

@@ -20,7 +20,7 @@ from skindb.optics.diffusion import (
 )
 from skindb.render.surfels import with_matt_surfels
 from skindb.schema import check, variables
-from skindb.types import Array, float64, lengths
+from skindb.types import Array, dots, float64, lengths
 
 REQUIRED = (
     variables.SURFEL_POSITION,
@@ -196,7 +196,7 @@ def thickness(position: Array, normal: Array, triangles: NDArray[np.integer]) ->
     )
     corner = position[triangles[np.maximum(face, 0)]]
     outwards = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    leaves = (face >= 0) & (np.einsum("nc,nc->n", outwards, normal) < 0)
+    leaves = (face >= 0) & (dots(outwards, normal) < 0)
     return np.where(leaves, distance + RAY_OFFSET_MM, np.inf)
 
 

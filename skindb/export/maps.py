@@ -18,6 +18,7 @@ from skindb.types import (
     Float32,
     Float64,
     Index32,
+    finite_rows,
     lengths,
     unit,
 )
@@ -246,7 +247,7 @@ def _spread_known(
     """
     together: dict[bytes, list[str]] = {}
     for name, values in parts.items():
-        finite = np.isfinite(values).all(axis=1) & (trust > 0)
+        finite = finite_rows(values) & (trust > 0)
         if finite.any():
             together.setdefault(finite.tobytes(), []).append(name)
     images: dict[str, Image] = {}

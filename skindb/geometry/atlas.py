@@ -39,6 +39,7 @@ from skindb.types import (
     Index,
     Index32,
     Mask,
+    dots,
     float64,
     lengths,
 )
@@ -211,13 +212,12 @@ def _intrinsic_weights(points: Array, faces: Index) -> sp.csr_matrix:
     ]
     tiny = 1e-9 * area.max()
     cot = [
-        -np.einsum("ni,ni->n", sides[k - 2], sides[k - 1]) / np.maximum(2 * area, tiny)
-        for k in range(3)
+        -dots(sides[k - 2], sides[k - 1]) / np.maximum(2 * area, tiny) for k in range(3)
     ]
     for k in range(3):
         i = faces[:, (k + 1) % 3]
         j = faces[:, (k + 2) % 3]
-        square = np.maximum(np.einsum("ni,ni->n", sides[k], sides[k]), tiny)
+        square = np.maximum(dots(sides[k], sides[k]), tiny)
         forth = MIX * cot[k] + (1 - MIX) * around[i] * cot[(k + 2) % 3] / square
         back = MIX * cot[k] + (1 - MIX) * around[j] * cot[(k + 1) % 3] / square
         weights = weights + _matrix(n, (i, j, forth), (j, i, back))
@@ -245,7 +245,7 @@ def _mean_value_weights(points: Array, faces: Index) -> sp.csr_matrix:
         to_right = points[before] - points[here]
         a = np.maximum(lengths(to_left), tiny)
         b = np.maximum(lengths(to_right), tiny)
-        cosine = np.einsum("ni,ni->n", to_left, to_right) / (a * b)
+        cosine = dots(to_left, to_right) / (a * b)
         # at least 1e-6 and at most 1e6, so that coinciding or opposite sides have
         # positive, finite weights
         half = np.sqrt(np.clip(1 - cosine, 1e-12, 2) / np.clip(1 + cosine, 1e-12, 2))
@@ -387,9 +387,9 @@ def _stretches(
     safe = np.where(flat, 1.0, double)[:, None]
     along_u = (pq * (t[2] - t[0])[:, None] - pr * (t[1] - t[0])[:, None]) / safe
     along_v = (pr * (s[1] - s[0])[:, None] - pq * (s[2] - s[0])[:, None]) / safe
-    a = np.einsum("ni,ni->n", along_u, along_u)
-    b = np.einsum("ni,ni->n", along_u, along_v)
-    c = np.einsum("ni,ni->n", along_v, along_v)
+    a = dots(along_u, along_u)
+    b = dots(along_u, along_v)
+    c = dots(along_v, along_v)
     largest = np.sqrt((a + c + np.hypot(a - c, 2 * b)) / 2)
     # from their product, 2 area / |double|, as their difference would suffer from cancellation
     smallest = 2 * area / np.abs(safe[:, 0]) / np.where(largest > 0, largest, 1.0)

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import csr_array, vstack
 
 from skindb.geometry.rays import RAY_OFFSET_MM, RayScene
-from skindb.types import Array, Faces, Index, unit
+from skindb.types import Array, Faces, Index, dots, unit
 
 # per vertex, cosine distributed: the error of the incoming light is an eighth of its
 # standard deviation
@@ -63,7 +63,7 @@ def bounce_transfer(
         )
         hit = np.flatnonzero((face >= 0) & (distance < FARTHEST_MM))
         sender = np.asarray(faces)[face[hit], corner[hit].argmax(axis=1)]
-        leaving = -np.einsum("nk,nk->n", way[hit], normals[sender])
+        leaving = -dots(way[hit], normals[sender])
         front = np.flatnonzero(leaving > 0)
         row, ray = np.divmod(hit[front], len(rays))
         leaves = transmittance(np.minimum(leaving[front], 1.0))

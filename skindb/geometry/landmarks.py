@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from skindb.geometry.mesh import closest_on_mesh
-from skindb.types import Array, Faces, Float64, float64
+from skindb.types import Array, Faces, Float64, finite_rows, float64
 
 MAX_SHAPE_ROUNDS = 100  # of the mean shape; a face needs about 5
 SETTLED = 1e-12  # relative change of the mean shape at which it has converged
@@ -115,7 +115,7 @@ def mean_shape(shapes: Array) -> Float64:
 
 def _onto(shape: Array, target: Array) -> Float64:
     """A shape (k, 2) after the similarity that best maps it to another."""
-    shared = np.isfinite(shape).all(axis=1) & np.isfinite(target).all(axis=1)
+    shared = finite_rows(shape) & finite_rows(target)
     if not shared.any():
         return float64(shape)
     matrix, shift = similarity(shape[shared], target[shared])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.spatial import cKDTree
 
-from skindb.types import Array, Faces, Float64, Index, Mask, float64, lengths
+from skindb.types import Array, Faces, Float64, Index, Mask, dots, float64, lengths
 
 MORTON_BITS = 21  # per axis: 63 bits in all
 POINTS_PER_BLOCK = 1 << 10  # each point may have a hundred candidate triangles
@@ -329,36 +329,32 @@ def _closest(point: Array, triangles: Array) -> Float64:
     # by orthogonalisation: Gram determinants are squared quantities, which lose
     # precision for needles
     base = _square(ab)
-    along = _dot(ab, ac) / base
-    ahead = _dot(ab, away) / base
+    along = dots(ab, ac) / base
+    ahead = dots(ab, away) / base
     height = ac - along[:, None] * ab
-    v = _dot(height, away - ahead[:, None] * ab) / _square(height)
+    v = dots(height, away - ahead[:, None] * ab) / _square(height)
     u = ahead - v * along
     inside = (u >= 0) & (v >= 0) & (u + v <= 1)
     weights = [np.stack([1 - u - v, u, v], axis=1)]
     off = u[:, None] * ab + v[:, None] * ac - away
-    squared = [np.where(inside, _dot(off, off), np.inf)]
+    squared = [np.where(inside, dots(off, off), np.inf)]
     for i, j in ((0, 1), (1, 2), (2, 0)):
         start = triangles[:, i]
         edge = triangles[:, j] - triangles[:, i]
-        t = np.clip(_dot(point - start, edge) / _square(edge), 0.0, 1.0)
+        t = np.clip(dots(point - start, edge) / _square(edge), 0.0, 1.0)
         weight = np.zeros((len(t), 3))
         weight[:, i] = 1 - t
         weight[:, j] = t
         weights.append(weight)
         off = start + t[:, None] * edge - point
-        squared.append(_dot(off, off))
+        squared.append(dots(off, off))
     best = np.argmin(squared, axis=0)
     return np.asarray(np.stack(weights)[best, np.arange(len(best))])
 
 
 def _square(a: Array) -> Float64:
     """Squared lengths (n,) to divide by."""
-    return np.maximum(_dot(a, a), np.finfo(np.float64).tiny)
-
-
-def _dot(a: Array, b: Array) -> Float64:
-    return np.asarray(np.einsum("nc,nc->n", a, b))
+    return np.maximum(dots(a, a), np.finfo(np.float64).tiny)
 
 
 def winding_number(vertices: Array, faces: Faces, points: Array) -> Float64:
@@ -375,8 +371,8 @@ def winding_number(vertices: Array, faces: Faces, points: Array) -> Float64:
         a, b, c = (triangles[:, i] - point for i in range(3))
         la, lb, lc = (lengths(side) for side in (a, b, c))
         # van Oosterom and Strackee 1983
-        volume = _dot(a, np.cross(b, c))
-        scale = la * lb * lc + _dot(a, b) * lc + _dot(b, c) * la + _dot(c, a) * lb
+        volume = dots(a, np.cross(b, c))
+        scale = la * lb * lc + dots(a, b) * lc + dots(b, c) * la + dots(c, a) * lb
         numbers.append(2 * np.arctan2(volume, scale).sum() / (4 * np.pi))
     return np.array(numbers, np.float64)
 

@@ -7,7 +7,18 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from skindb.geometry._ray_kernels import aim
-from skindb.types import Array, Faces, Float32, Float64, Index, Index32, Mask, float64
+from skindb.types import (
+    Array,
+    Faces,
+    Float32,
+    Float64,
+    Index,
+    Index32,
+    Mask,
+    dots,
+    finite_rows,
+    float64,
+)
 
 RAYS_PER_BLOCK = 1 << 15  # so that the arrays of the rays stay in the cache
 NUDGE = 1e-3 * np.array([0.62, 0.55, -0.56])  # mm
@@ -118,7 +129,7 @@ class RayScene:
             part = slice(i, i + RAYS_PER_BLOCK)
             start = begin[part] - self._centre
             with np.errstate(invalid="ignore", divide="ignore"):
-                length = np.sqrt(np.einsum("ni,ni->n", towards[part], towards[part]))
+                length = np.sqrt(dots(towards[part], towards[part]))
                 way = towards[part] / length[:, None]
             faces = self._first(start, way)
             face[part] = faces
@@ -150,7 +161,7 @@ class RayScene:
         face = self._run("INTERSECT", start, way)
         # one in a hundred rays that aim exactly at a vertex misses the mesh: misses are
         # repeated with a small shift
-        missed = np.flatnonzero((face < 0) & np.isfinite(start + way).all(axis=1))
+        missed = np.flatnonzero((face < 0) & finite_rows(start + way))
         face[missed] = self._run("INTERSECT", start[missed] + NUDGE, way[missed])
         return face
 
@@ -180,11 +191,11 @@ def _refine(
     from_a = origin - a
     p = np.cross(direction, ac)
     q = np.cross(from_a, ab)
-    determinant = np.einsum("ni,ni->n", ab, p)
+    determinant = dots(ab, p)
     # edge-on in float64 although Embree reports a hit: corner a replaces the hit
     safe = np.where(np.abs(determinant) > 0, determinant, np.inf)
-    u = np.einsum("ni,ni->n", from_a, p) / safe
-    v = np.einsum("ni,ni->n", direction, q) / safe
+    u = dots(from_a, p) / safe
+    v = dots(direction, q) / safe
     weight = np.clip(np.stack([1 - u - v, u, v], axis=1), 0.0, 1.0)
     weight /= weight.sum(axis=1, keepdims=True)
     point = np.einsum("nk,nki->ni", weight, triangles)

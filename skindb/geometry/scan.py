@@ -23,7 +23,7 @@ from skindb.limits import (
     MAX_SCAN_HEADER_BYTES,
     MAX_SCAN_VERTICES,
 )
-from skindb.types import Array, Bytes, Faces, Float64, Index, Mask, float64
+from skindb.types import Array, Bytes, Faces, Float64, Index, Mask, finite_rows, float64
 
 MAX_COLOUR = 255  # of the eight bits of a colour of a vertex
 CURE = "export the scan again as a triangle mesh in mm (PLY or OBJ)"
@@ -137,7 +137,7 @@ def _faults(file: str, vertices: Array, faces: Index) -> list[Fault]:
     if len(faces) == 0:
         finding = f"{len(vertices)} vertices and no face"
         faults.append(Fault(file, "a scan must have triangles", finding, CURE))
-    bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+    bad = np.flatnonzero(~finite_rows(vertices))
     if len(bad):
         finding = f"{len(bad)} that are not finite, first vertex {bad[0]}"
         faults.append(Fault(file, "vertices must be finite numbers", finding, CURE))

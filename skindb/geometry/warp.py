@@ -17,7 +17,16 @@ from skindb.geometry.mesh import (
     vertex_areas,
     vertex_normals,
 )
-from skindb.types import Array, Float64, Index, Mask, float64, lengths
+from skindb.types import (
+    Array,
+    Float64,
+    Index,
+    Mask,
+    dots,
+    finite_rows,
+    float64,
+    lengths,
+)
 
 # of the spread of the points: half a millimetre on a face, less than the error of a
 # click
@@ -270,7 +279,7 @@ class _System:
 
 def _merged(source: Array, target: Array) -> tuple[Float64, Float64, Mask]:
     """Distinct points of both, and mask of the points that represent them."""
-    is_used = np.isfinite(np.hstack([source, target])).all(axis=1)
+    is_used = finite_rows(np.hstack([source, target]))
     finite = np.flatnonzero(is_used)
     group = np.arange(len(source))
     for points in (source, target):
@@ -298,8 +307,8 @@ def _spread(points: Array) -> float:
 
 def _finite(source: Array, target: Array) -> tuple[Float64, Float64]:
     """Points that are finite in both."""
-    finite = np.isfinite(np.hstack([source, target])).all(axis=1)
-    return np.asarray(source)[finite], np.asarray(target)[finite]
+    finite = finite_rows(np.hstack([source, target]))
+    return float64(source)[finite], float64(target)[finite]
 
 
 def _plain(
@@ -386,7 +395,7 @@ class Sheet:
 
     def known(self) -> Mask:
         """Which landmarks (k,) it has."""
-        return np.asarray(np.isfinite(self.landmark).all(axis=1))
+        return finite_rows(self.landmark)
 
     def area(self) -> float:
         """In mm2."""
@@ -482,7 +491,7 @@ def _aligned(
         # onto the tangent plane of the nearest vertex, in which the point may slide
         step = np.einsum("nij,nj->ni", across, take.position[near] - aligned)
         pull[n:] = aligned + step - start
-        facing = np.einsum("ni,ni->n", normal, target_normal) > MIN_COSINE_NORMALS
+        facing = dots(normal, target_normal) > MIN_COSINE_NORMALS
         close = distance < MAX_ALIGNING_DISTANCE_MM
         is_used[n:] = close & facing & ~take.rim[near] & ~on_rim
         if i == OUTLINE_ROUND:

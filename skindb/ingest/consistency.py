@@ -29,7 +29,7 @@ from skindb.ingest.photo_offsets import (
 )
 from skindb.ingest.surfels import SurfelSet
 from skindb.numerics.statistics import correlation
-from skindb.types import Float32, Float64, Half, Index, Mask
+from skindb.types import Float32, Float64, Half, Index, Mask, dots, finite_rows
 
 Pair = tuple[int, int]  # light, camera
 LIGHTS_PER_CAMERA = 3  # those that illuminate the largest part of what the camera sees
@@ -131,7 +131,7 @@ class CalibrationCheck:
         for j, light in enumerate(self.dome.lights):
             square, falloff = light_falloff(light, self._position)
             way = light.position - self._position
-            cosine = np.einsum("ni,ni->n", way, self._normal) / np.sqrt(square)
+            cosine = dots(way, self._normal) / np.sqrt(square)
             visible = self.light_visible[self.compared, j].astype(np.float64)
             lit = np.maximum(cosine, 0) * visible
             rows.append(lit * falloff / square * self.intensity[j].mean())
@@ -391,7 +391,7 @@ class CalibrationCheck:
             self._position, turned.K, turned.R, turned.t, turned.distortion
         )
         visible = (self.cosine(turned) > 0) & (depth > 0)
-        visible &= np.isfinite(turned_pixels).all(axis=1)
+        visible &= finite_rows(turned_pixels)
         yield (
             "R looks transposed",
             np.nan_to_num(turned_pixels / factor, nan=-1.0),

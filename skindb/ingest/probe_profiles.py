@@ -18,7 +18,7 @@ from skindb.errors import Fault, InputError, attempt, input_error, require
 from skindb.format.contact_probe import ProbeRecord
 from skindb.format.fields import MAX_MAGNITUDE
 from skindb.format.frames import Digests
-from skindb.types import Float64, Index, Mask, float64
+from skindb.types import Float64, Index, Mask, finite_rows, float64
 
 # the mean and two harmonics have five unknowns; one degree of freedom remains
 MIN_AZIMUTHS = 6
@@ -546,7 +546,7 @@ def _decay_notes(probe: ProbeRecord, profiles: Profiles) -> Iterator[str]:
     log = np.full(value.shape, np.nan)
     np.log(value * distance[:, None] ** 2, out=log, where=clear)
     decay = np.array([[_decay(distance, site[:, c]) for c in (0, 2)] for site in log])
-    decay = decay[np.isfinite(decay).all(axis=1)]
+    decay = decay[finite_rows(decay)]
     if len(decay):
         red, blue = np.median(decay, axis=0)
         low, high = RED_DECAYS

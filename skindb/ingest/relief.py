@@ -19,7 +19,7 @@ from skindb.errors import attempt_all, require
 from skindb.format.dome import CameraRecord, DomeRecord, LightRecord
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.geometry.scan import Scan
-from skindb.types import Float32, Float64, Half, Index, Mask
+from skindb.types import Float32, Float64, Half, Index, Mask, dots, finite_rows
 
 # error of the normals for which their prior has no effect [degree]
 NO_SCAN_DEGREES = 60.0
@@ -106,7 +106,7 @@ def estimate_relief(
     for _ in range(rounds):
         points = camera.centre + depth[..., None] * rays
         normal = photometric_normals(values, lit, dome.lights, points, -rays)
-        known = np.asarray(np.isfinite(normal).all(axis=-1))
+        known = finite_rows(normal)
         require(
             bool(known.any()),
             f"{dome.file}[frames]",
@@ -251,7 +251,7 @@ def _normals_of(
     )
     length = np.linalg.norm(solution, axis=1)
     unit = solution / np.maximum(length, 1e-300)[:, None]
-    facing = np.einsum("pa,pa->p", unit, view)
+    facing = dots(unit, view)
     good = (spread[:, 0] > MIN_SPREAD * spread[:, 2]) & (facing > 0) & (length > 0)
     return np.where(good[:, None], unit, np.nan)
 

@@ -30,7 +30,7 @@ from skindb.geometry.mesh import (
     vertex_normals,
 )
 from skindb.geometry.rays import RayScene
-from skindb.types import Float32, Float64, Index, Mask, float64, lengths
+from skindb.types import Float32, Float64, Index, Mask, dots, float64, lengths
 
 MAX_SURFELS = 2_500_000  # the samples of this many surfels in a full dome take 36 GB
 # mm; a landmark that is farther from the cropped than from the complete scan by this
@@ -68,7 +68,7 @@ class SurfelSet:
     def cosine(self, camera: CameraRecord, part: slice = slice(None)) -> Float64:
         """Cosine (n,) between normals and the direction to the camera."""
         way = camera.centre - self.position[part]
-        cosine = np.einsum("ni,ni->n", way, self.normal[part])
+        cosine = dots(way, self.normal[part])
         return np.asarray(cosine / lengths(way))
 
     def spacing(self) -> float:
@@ -258,7 +258,7 @@ def light_visibility(
     def visible_fraction(light: LightRecord) -> Half:
         fraction = np.zeros(len(surfels.position), np.float16)
         way = light.position - surfels.position
-        facing = np.einsum("ni,ni->n", way, surfels.normal) > 0
+        facing = dots(way, surfels.normal) > 0
         indices = np.flatnonzero(facing)
         centre, *ring = disc_points(light)
         fraction[indices] = _visible(surfels, scene, centre, indices)
@@ -373,7 +373,7 @@ def _in_picture(surfels: SurfelSet, camera: CameraRecord) -> tuple[Float64, Mask
         part = slice(i, i + SURFELS_PER_BLOCK)
         position = surfels.position[part]
         projected = camera.project(position)
-        facing = np.einsum("ni,ni->n", centre - position, surfels.normal[part]) > 0
+        facing = dots(centre - position, surfels.normal[part]) > 0
         pixels[part] = projected
         inside[part] = facing & ((projected >= 0.5) & (projected <= limit)).all(axis=1)
     return pixels, inside

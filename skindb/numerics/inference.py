@@ -20,7 +20,7 @@ import numpy as np
 from scipy import stats
 
 from skindb.numerics.statistics import CONFIDENCE, ROUNDING
-from skindb.types import AnyArray, Array, Index, Mask, float64
+from skindb.types import AnyArray, Array, Index, Mask, finite_rows, float64
 
 Draw = AnyArray  # an order, signs or labels of the subjects, or many of them
 SUMS = 8  # values in memory per draw and quantity, or subject
@@ -567,7 +567,7 @@ def _within(values: Array) -> Array:
     for a, b in combinations(range(values.shape[2]), 2):
         difference = values[:, :, a] - values[:, :, b]
         # the same subjects in all permutations
-        difference = difference[:, np.isfinite(difference[0]).all(axis=1)]
+        difference = difference[:, finite_rows(difference[0])]
         n = difference.shape[1]
         mean = difference.mean(axis=1)
         scatter = ((difference - mean[:, None]) ** 2).sum(axis=(1, 2)) / (n - 1)

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from skindb.numerics import _nnls_kernels
-from skindb.types import Array, Index32, Mask
+from skindb.types import Array, Index32, Mask, finite_rows
 
 # largest KKT residual, relative to max |M'r| after scaling columns to unit length
 TOLERANCE = 1e-10
@@ -42,7 +42,7 @@ def solve_nnls(
     kkt = np.full(len(b), np.nan)
     count = np.zeros(len(b), np.int32)
     met = np.zeros(len(b), bool)
-    valid = np.isfinite(G).all(axis=(1, 2)) & np.isfinite(b + x).all(axis=1)
+    valid = np.isfinite(G).all(axis=(1, 2)) & finite_rows(b + x)
     finite = np.asarray(valid)
     _nnls_kernels.solve_many(G, b, x, finite, TOLERANCE, kkt, count, met)
     x[~finite] = np.nan

@@ -27,7 +27,7 @@ from scipy.fft import fftfreq, irfft2, rfft2, rfftfreq
 from scipy.optimize import isotonic_regression
 from scipy.sparse import csr_array
 
-from skindb.types import Array, Float64, Index, Mask, float64
+from skindb.types import Array, Float64, Index, Mask, finite_rows, float64
 
 Image = Array
 Spectrum = NDArray[np.complexfloating[Any, Any]]
@@ -400,7 +400,7 @@ def valid_quantiles(values: Float64) -> Float64:
     flat = values.reshape(-1, values.shape[-1])
     out = np.array(flat, float)
     decreasing = (np.diff(flat, axis=1) < 0).any(axis=1)
-    for i in np.flatnonzero(np.isfinite(flat).all(axis=1) & decreasing):
+    for i in np.flatnonzero(finite_rows(flat) & decreasing):
         out[i] = isotonic_regression(flat[i]).x
     return out.reshape(values.shape)
 

@@ -55,7 +55,7 @@ from skindb.reflectance.sampling import (
 from skindb.reflectance.tables import Table, tabulate
 from skindb.schema import FitStatus, check, dataset, variables
 from skindb.schema.notes import Omission
-from skindb.types import Array, Float32, float64
+from skindb.types import Array, Float32, dots, float64
 
 ALBEDO_NODES = 24  # roughnesses at which the reflectance of a lobe is integrated
 # tables that stand for all lobes of a take, between which weights are interpolated; with a
@@ -293,10 +293,10 @@ class LobeSampler:
     def pdf(self, mix: Array, normal: Array, view: Array, towards: Array) -> Array:
         """Density (n,) per steradian of `sample`; 0 below the surface."""
         probability, roughness = mix.T
-        cosine = np.einsum("nc,nc->n", normal, towards)
+        cosine = dots(normal, towards)
         half = half_vectors(view, towards)
-        cos_h = np.maximum(np.einsum("nc,nc->n", half, normal), 0.0)
-        cos_d = np.einsum("nc,nc->n", half, view)
+        cos_h = np.maximum(dots(half, normal), 0.0)
+        cos_d = dots(half, view)
         square = roughness**2
         spread = square / (np.pi * (cos_h**2 * (square - 1) + 1) ** 2)
         lobe = spread * cos_h / (4 * np.maximum(cos_d, MIN_COSINE_HALF))

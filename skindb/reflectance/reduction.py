@@ -37,7 +37,7 @@ from skindb.reflectance.tables import (
     stored_brdf,
 )
 from skindb.schema import FitStatus, check, dataset
-from skindb.types import AnyArray, Array, Index, Mask, float64
+from skindb.types import AnyArray, Array, Index, Mask, dots, finite_rows, float64
 
 FRANK_WOLFE_STEPS = 200  # each step gives a valid bound; 500 steps lower it by 1 %
 MIN_COSINE_SAMPLES = 0.1  # cosine to light and camera above which fits use samples
@@ -358,7 +358,7 @@ def fitted_surfels(fitted: xr.Dataset, names: Sequence[str]) -> Index:
     good = fitted["fit_status"].values == FitStatus.FITTED
     for name in names:
         values = fitted[name].values.reshape(len(good), -1)
-        good = good & np.isfinite(values).all(axis=1)
+        good = good & finite_rows(values)
     if not good.any():
         status, count = np.unique(fitted["fit_status"].values, return_counts=True)
         counts_by_status = ", ".join(
@@ -428,9 +428,7 @@ def residuals(systems: Systems, H: Array | None = None) -> tuple[Array, Array]:
     """
     reduced = systems if H is None else systems.within(H)
     x, _, _, _ = solve_nnls(reduced.gram, reduced.rhs)
-    fitted = np.einsum("nk,nkl,nl->n", x, reduced.gram, x) - 2 * np.einsum(
-        "nk,nk->n", reduced.rhs, x
-    )
+    fitted = np.einsum("nk,nkl,nl->n", x, reduced.gram, x) - 2 * dots(reduced.rhs, x)
     return x, np.maximum(systems.square + fitted, 0.0)
 
 

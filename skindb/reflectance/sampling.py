@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from skindb.reflectance.tables import directional_albedo
-from skindb.types import Array, Float32, Mask, float64, lengths, unit
+from skindb.types import Array, Float32, Mask, dots, float64, lengths, unit
 
 # fraction of directions drawn by the cosine alone, as tables have tails that do not
 # depend on the half vector
@@ -104,10 +104,10 @@ class TableSampler:
         """Density (n,) per steradian with which `sample` draws the directions `towards`
         (n, 3); 0 below the surface.
         """
-        cosine = np.einsum("nc,nc->n", normal, towards)
+        cosine = dots(normal, towards)
         half = half_vectors(view, towards)
-        cos_h = np.clip(np.einsum("nc,nc->n", half, normal), -1.0, 1.0)
-        cos_d = np.einsum("nc,nc->n", half, view)
+        cos_h = np.clip(dots(half, normal), -1.0, 1.0)
+        cos_d = dots(half, view)
         # from the sine, because an arc cosine is too inaccurate for narrow lobes
         theta = np.arctan2(lengths(np.cross(half, normal)), cos_h)
         u = np.sqrt(np.clip(theta / (np.pi / 2), 1e-12, 1.0))
@@ -146,7 +146,7 @@ def by_half_vector(
         + (sine * np.sin(turn))[:, None] * second
         + cosine[:, None] * normal
     )
-    mirror = 2 * np.einsum("nc,nc->n", view, drawn)[:, None] * drawn - view
+    mirror = 2 * dots(view, drawn)[:, None] * drawn - view
     return np.asarray(np.where(mirrored[:, None], mirror, drawn))
 
 

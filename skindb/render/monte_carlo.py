@@ -26,7 +26,7 @@ from skindb.render.shading import (
     trace_view,
     transmitted_irradiance,
 )
-from skindb.types import Array, Float32, Index, Mask, Progress, float64, lengths
+from skindb.types import Array, Float32, Index, Mask, Progress, dots, float64, lengths
 
 Image = Float32
 # rays per pixel and axis in one batch; random numbers are stratified over the rays of a
@@ -260,7 +260,7 @@ class _Painter:
         values = np.zeros((len(view.pixel), 3))
         for chosen, weight in choice.draw(view, rng):
             points = points_on_discs(lights, chosen, rng)
-            above = np.einsum("nc,nc->n", points - view.position, view.normal) > 0
+            above = dots(points - view.position, view.normal) > 0
             rows = np.flatnonzero(above)
             hidden = self.scene.occluded(
                 view.position[rows], points[rows], normal=view.normal[rows]
@@ -299,7 +299,7 @@ class _Painter:
             self.lobes.sample(mix, view.normal, view.towards, lobe),
         )
         for sampler, towards in enumerate(drawn):
-            above = np.flatnonzero(np.einsum("nc,nc->n", towards, view.normal) > 0)
+            above = np.flatnonzero(dots(towards, view.normal) > 0)
             target = view.position[above] + FAR * towards[above]
             rows = above[
                 ~self.scene.occluded(
@@ -375,7 +375,7 @@ class _Painter:
                     sine * np.sin(turn)
                 )[:, None] * second
                 towards += height[:, None] * normals
-            cosine = np.einsum("nc,nc->n", towards, normals)
+            cosine = dots(towards, normals)
             front = np.flatnonzero(cosine > 0)
             target = points[front] + FAR * towards[front]
             lit = front[

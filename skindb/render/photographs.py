@@ -30,7 +30,7 @@ from skindb.render.shading import (
 from skindb.render.surfels import surfel_confidence
 from skindb.schema import check, variables
 from skindb.schema.consent import honour_consent
-from skindb.types import Array, Bytes, Float32, Float64, Mask, float64
+from skindb.types import Array, Bytes, Float32, Float64, Mask, finite_rows, float64
 
 # pixels, the default of Wang et al. 2004's uniform window in scikit-image
 SSIM_WINDOW = 7
@@ -129,7 +129,7 @@ def _prepared(
         raise ValueError(
             f"both images must have the shape (h, w, 3), found {ours.shape} and {theirs.shape}"
         )
-    finite = np.isfinite(ours).all(axis=-1) & np.isfinite(theirs).all(axis=-1)
+    finite = finite_rows(ours) & finite_rows(theirs)
     inside = np.asarray(finite if mask is None else finite & mask, np.bool_)
     if not inside.any():
         raise ValueError(
@@ -360,7 +360,7 @@ def compare_photographs(
             gloss *= polariser_factor(view, lamp.position[0], both, surface.eta)
         radiance = photograph[variables.PHOTOGRAPH_RADIANCE].values
         photo = radiance[: camera.height, : camera.width].astype(np.float32)
-        mask = (view.coverage >= MIN_COVERAGE) & np.isfinite(photo).all(axis=-1)
+        mask = (view.coverage >= MIN_COVERAGE) & finite_rows(photo)
         if not mask.any():
             continue  # this camera does not see the face
         light = str(dome["light"].values[at_light])

@@ -15,7 +15,7 @@ from skindb.render.monte_carlo import Lighting
 from skindb.render.scene import Camera, Lights, Surface
 from skindb.render.shading import View, entering_light, trace_view, tree_opening
 from skindb.schema.notes import Omission
-from skindb.types import Array, Index, Mask
+from skindb.types import Array, Index, Mask, dots
 
 Omissions = tuple[Omission, ...]
 # rad, by which normals between the rays of a trace differ from those at the rays
@@ -192,7 +192,7 @@ def lights_above_horizon(lights: Lights, view: View) -> tuple[Lights, Omissions]
     )
     lit = np.zeros(len(lights), bool)
     for i in range(len(lights)):
-        height = np.einsum("nc,nc->n", lights.position[i] - view.position, view.normal)
+        height = dots(lights.position[i] - view.position, view.normal)
         slack = (
             lights.disc_radius[i]
             + margin
@@ -297,9 +297,7 @@ def _unshadowed(lights: Lights, surface: Surface, view: View, rows: Index) -> Ar
 def _irradiance(light: Lights, surface: Surface) -> Array:
     """Irradiance (v, 3) under the boundary of one light, without shadows."""
     towards = light.position[0] - surface.vertices
-    square = np.einsum("nc,nc->n", towards, towards)
-    cosine = np.clip(
-        np.einsum("nc,nc->n", towards, surface.normals) / np.sqrt(square), 0, 1
-    )
+    square = dots(towards, towards)
+    cosine = np.clip(dots(towards, surface.normals) / np.sqrt(square), 0, 1)
     entering = entering_light(light, 0, towards, square, cosine, surface.eta)
     return np.asarray(entering[:, None] * light.intensity[0])

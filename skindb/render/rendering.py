@@ -42,7 +42,7 @@ from skindb.render.shading import (
 )
 from skindb.schema.consent import honour_consent
 from skindb.schema.notes import Omission
-from skindb.types import Float32, Mask, Progress, lengths
+from skindb.types import Float32, Mask, Progress, dots, lengths
 
 UNITS = "radiance"  # in the unit of the photographs, or of the environment
 NO_LIGHTS = Lights(
@@ -467,7 +467,7 @@ def fixed_exposure(lighting: Lighting, camera: Camera) -> float:
         square = np.square(lights.position).sum(axis=1)
         along = (
             np.maximum(
-                np.einsum("lc,lc->l", -lights.position, lights.axis) / np.sqrt(square),
+                dots(-lights.position, lights.axis) / np.sqrt(square),
                 0,
             )
             ** lights.falloff

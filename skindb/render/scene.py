@@ -25,7 +25,17 @@ from skindb.reflectance.kinds import even_diffuse, surface_model
 from skindb.reflectance.model import ReflectanceModel
 from skindb.render.image import read_exr
 from skindb.schema import FitStatus, check, variables
-from skindb.types import AnyArray, Array, Faces, Index, Mask, float64, lengths, unit
+from skindb.types import (
+    AnyArray,
+    Array,
+    Faces,
+    Index,
+    Mask,
+    finite_rows,
+    float64,
+    lengths,
+    unit,
+)
 
 NEEDED = (
     variables.SURFEL_POSITION,
@@ -73,10 +83,7 @@ class Surface:
         """(v,) vertices with finite values; triangles with any other vertex occlude but
         reflect no light.
         """
-        finite = [
-            np.isfinite(x).all(axis=1)
-            for x in (self.normals, self.diffuse, self.parameters)
-        ]
+        finite = [finite_rows(x) for x in (self.normals, self.diffuse, self.parameters)]
         return np.asarray(np.logical_and.reduce(finite), np.bool_)
 
 
@@ -253,7 +260,7 @@ def usable_surfels(values: dict[str, AnyArray]) -> Mask:
         ],
     )
     for name in (variables.SHADING_NORMAL, variables.DIFFUSE_REFLECTANCE, "parameters"):
-        good &= np.isfinite(values[name]).all(axis=1)
+        good &= finite_rows(values[name])
     return good
 
 

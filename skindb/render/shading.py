@@ -17,7 +17,7 @@ from skindb.optics.dipole_tree import subsurface_exitance
 from skindb.optics.fresnel import circular_reversal, fresnel_transmittance
 from skindb.reflectance.model import Lamp, Points
 from skindb.render.scene import Camera, Lights, Surface
-from skindb.types import Array, Float32, Index, Mask, lengths, unit
+from skindb.types import Array, Float32, Index, Mask, dots, finite_rows, lengths, unit
 
 DEFAULT_OPENING = 0.1  # of the octree
 # range of openings: below it, the tree takes longer than it saves; above it, pictures
@@ -81,8 +81,8 @@ def received_light(
     (n, 3), each lit from a place (n, 3) of the light; 0 in shadows and behind.
     """
     towards = place - points
-    square = np.einsum("nc,nc->n", towards, towards)
-    cosine = np.einsum("nc,nc->n", towards, normals) / np.sqrt(square)
+    square = dots(towards, towards)
+    cosine = dots(towards, normals) / np.sqrt(square)
     front = np.flatnonzero(cosine > 0)
     hidden = scene.occluded(points[front], place[front], normal=normals[front])
     lit = front[~hidden]
@@ -208,11 +208,7 @@ def _exitances_from_irradiance(
         raise ValueError(
             "the surface must have s and sigma_tr for subsurface transport, found None"
         )
-    finite = (
-        surface.known
-        & np.isfinite(surface.s).all(axis=1)
-        & np.isfinite(surface.sigma_tr).all(axis=1)
-    )
+    finite = surface.known & finite_rows(surface.s) & finite_rows(surface.sigma_tr)
     out = np.zeros((irradiance.shape[1], len(surface.vertices), 3), np.float32)
     out[:, finite] = subsurface_exitance(
         surface.vertices[finite],
@@ -406,7 +402,7 @@ def _facing_points(
         normal = unit(normal)
         towards = camera.centre - position
         towards = unit(towards)
-        facing = (np.einsum("nc,nc->n", normal, towards) > 0) & (
+        facing = (dots(normal, towards) > 0) & (
             _facet_cosine(surface, corners, towards) > 0
         )
     return position, normal, towards, facing
@@ -492,7 +488,7 @@ def glow_image(view: View, surface: Surface, glow: Image) -> Image:
 
 def _facet_cosine(surface: Surface, corners: Index, towards: Array) -> Array:
     a, b, c = (surface.vertices[corners[:, i]] for i in range(3))
-    return np.asarray(np.einsum("nc,nc->n", np.cross(b - a, c - a), towards))
+    return dots(np.cross(b - a, c - a), towards)
 
 
 def _lamp_points(lights: Lights, i: int, total: int) -> Array:
@@ -528,5 +524,5 @@ def escape_factor(view: View, eta: float) -> Array:
     """(n, 1) F_t(w_o) / pi: radiance towards the camera per radiant exitance under the
     boundary (eq. 9).
     """
-    cosine = np.einsum("nc,nc->n", view.normal, view.towards)
+    cosine = dots(view.normal, view.towards)
     return np.asarray(fresnel_transmittance(cosine, eta) / np.pi)[:, None]

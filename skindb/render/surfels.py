@@ -15,7 +15,16 @@ from skindb.reflectance.model import Lamp, Points, ReflectanceModel
 from skindb.render.scene import usable_surfels
 from skindb.schema import FitStatus, TexelStatus, Use, check, names_of, variables
 from skindb.schema.declaration import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
-from skindb.types import Array, Bytes, Float32, Index32, float64, lengths
+from skindb.types import (
+    Array,
+    Bytes,
+    Float32,
+    Index32,
+    dots,
+    finite_rows,
+    float64,
+    lengths,
+)
 
 Codes = Bytes
 STATUS = {FitStatus.FITTED: TexelStatus.MEASURED} | dict.fromkeys(
@@ -72,7 +81,7 @@ def surfel_texels(fitted: xr.Dataset) -> Codes:
     surface = [name for name in names_of(Use.SURFACE) if name in fitted]
     needed = (variables.SHADING_NORMAL, variables.DIFFUSE_REFLECTANCE, *surface)
     for name in needed:
-        finite = np.isfinite(fitted[name].values.reshape(len(code), -1)).all(axis=1)
+        finite = finite_rows(fitted[name].values.reshape(len(code), -1))
         code[~finite] = TexelStatus.FILLED
     return code
 
@@ -279,7 +288,7 @@ def _to_measured(
     flat = lengths(across)[..., None] < 1e-6
     axis = np.where(sine > 1e-6, axis, np.where(flat, tangent, across))
     axis /= np.maximum(lengths(axis)[..., None], 1e-12)
-    angle = np.arctan2(sine[:, 0], np.einsum("nc,nc->n", normal, half))
+    angle = np.arctan2(sine[:, 0], dots(normal, half))
     seen = np.radians(fitted[variables.SMALLEST_HALF_ANGLE].values.astype(np.float64))
     return Rotation.from_rotvec(np.maximum(seen - angle, 0.0)[:, None] * axis)
 
@@ -292,8 +301,8 @@ def _brdfs(
     lamp = Lamp(to_light[:, None], lit, np.zeros(3), 0.0)
     radiance = surface.shade(points, lamp, eta=eta)
     # for a lamp at a distance of 1 mm, radiance per radiant intensity is f_r cos(theta_i) per mm2
-    cosine = np.einsum("nc,nc->n", points.normal, to_light)[:, None]
-    seen = np.einsum("nc,nc->n", points.normal, points.view)[:, None]
+    cosine = dots(points.normal, to_light)[:, None]
+    seen = dots(points.normal, points.view)[:, None]
     above = (cosine > 0) & (seen > 0)
     f_r = np.divide(radiance, cosine, out=np.zeros(radiance.shape), where=above)
     return np.asarray(f_r)
