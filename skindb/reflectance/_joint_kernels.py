@@ -365,9 +365,10 @@ def _write_equations(
             mixed = M[TURNED + k, SURFACE + q] + M[SURFACE + k, TURNED + q]
             m.turn[k, q] = squares * M[TURNED + k, TURNED + q] + total * mixed
             m.turn[k, q] += 3.0 * M[SURFACE + k, SURFACE + q]
-    precision = _least_variance(count, b, m) / lobes.gloss_spread**2
-    m.gram[3, 3] += precision
-    m.target[3] += precision * lobes.gloss
+    if wide > 0:
+        precision = _least_variance(count, b, m) / lobes.gloss_spread**2
+        m.gram[3, 3] += precision
+        m.target[3] += precision * lobes.gloss
 
 
 @kernel

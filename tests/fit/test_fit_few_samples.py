@@ -21,7 +21,12 @@ from skindb.fit import (
     refine_jointly,
 )
 from skindb.reflectance.ggx import GGX
-from skindb.reflectance.joint import SHARED_REFLECTANCE, SHARED_WIDTH, UNKNOWN_GLOSS
+from skindb.reflectance.joint import (
+    SHARED_REFLECTANCE,
+    SHARED_WIDTH,
+    UNKNOWN_GLOSS,
+    Gloss,
+)
 from skindb.reflectance.lobes import GRADED_ROUGHNESS, SURFACE_INDEX
 from skindb.reflectance.mixture import Mixture
 from skindb.render.scene import from_model
@@ -175,6 +180,18 @@ def test_estimate_gloss__is_unknown_for_many_or_too_few_samples():
         lumitexels, _ = _planted(_lights(count), gloss=STRENGTH)
         prior = estimate_gloss(lumitexels, eta=ETA, scan_error=60.0)
         assert prior == UNKNOWN_GLOSS
+
+
+def test_refine_jointly__three_samples_have_no_gloss_whatever_the_prior():
+    lumitexels, _ = _planted(_lights(3), gloss=STRENGTH)
+    fitted = lumitexels.merge(estimate_normals(lumitexels, eta=ETA, scan_error=60.0))
+    fitted = fitted.merge(estimate_diffuse_reflectance(fitted, eta=ETA))
+    unknown, glossy = (
+        refine_jointly(fitted, eta=ETA, scan_error=60.0, gloss=prior)
+        for prior in (UNKNOWN_GLOSS, Gloss(5.0, 2.5))
+    )
+    for name in ("shading_normal", "diffuse_reflectance"):
+        np.testing.assert_array_equal(unknown[name], glossy[name])
 
 
 def test_shared_reflectance__is_that_of_the_lobe():
