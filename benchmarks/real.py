@@ -73,6 +73,7 @@ PARTS = (
     "faces",
     "cat",
     "lights",
+    "face-lights",
     "sphere",
     "brdfs",
     "exposures",
@@ -278,6 +279,20 @@ def common_lights(
     return replace(person.divided_by(common.gain), light=light)
 
 
+def with_lights_of_others(people: list[Photographs]) -> list[Photographs]:
+    """Each person with the gains and directions of the lights from the others."""
+    rig = [_light_residuals(person) for person in people]
+    return [
+        common_lights(
+            person,
+            people[:k] + people[k + 1 :],
+            rig[:k] + rig[k + 1 :],
+            turned=True,
+        )
+        for k, person in enumerate(people)
+    ]
+
+
 def face_rows(people: list[Photographs]) -> list[list[str]]:
     """Errors at held-out lights of the faces [%], mean over the people."""
     rig = [_light_residuals(person) for person in people]
@@ -349,27 +364,35 @@ def cat_rows(photographs: Photographs) -> list[list[str]]:
     return rows
 
 
-def light_rows(photographs: Photographs) -> list[list[str]]:
-    """Errors of the cat by the number of training lights, of all models at the pixels for
-    which skindb has one.
+def light_rows(objects: list[Photographs]) -> list[list[str]]:
+    """Errors by the number of training lights, mean over the objects, of all models at
+    the pixels for which skindb has one.
     """
-    rows = [
-        [
-            "cat: normals, mean [deg] / held-out lights [%]",
-            *(f"{n} lights" for n in LIGHT_COUNTS),
-        ]
-    ]
-    known = dict[int, Mask]()
+    measured = objects[0].normal is not None
+    title = "cat: normals, mean [deg] / held-out lights [%]"
+    if not measured:
+        title = f"{len(objects)} faces, lights by the others: held-out lights [%]"
+    rows = [[title, *(f"{n} lights" for n in LIGHT_COUNTS)]]
+    known = dict[tuple[str, int], Mask]()
     for name, method in methods(SKIN).items():
         cells = []
         for count in LIGHT_COUNTS:
-            fitted = method(photographs, spread(photographs, count))
-            if name == "skindb":
-                known[count] = np.isfinite(fitted.predicted).any(axis=1)
-            cells.append(_errors_at(photographs, fitted, known[count]))
+            errors = []
+            for photographs in objects:
+                fitted = method(photographs, spread(photographs, count))
+                key = (photographs.name, count)
+                if name == "skindb":
+                    known[key] = np.isfinite(fitted.predicted).any(axis=1)
+                errors.append(_errors_at(photographs, fitted, known[key]))
+            angle, error = np.mean(errors, axis=0)
+            cells.append(f"{angle:.1f} / {error:.1f}" if measured else f"{error:.1f}")
         rows.append([name, *cells])
-    fractions = [f"{100 * known[count].mean():.0f}" for count in LIGHT_COUNTS]
-    return [*rows, ["pixels with a model of skindb [%]", *fractions]]
+    fractions = [
+        100 * np.mean([known[o.name, count].mean() for o in objects])
+        for count in LIGHT_COUNTS
+    ]
+    label = "pixels with a model of skindb [%]"
+    return [*rows, [label, *(f"{value:.0f}" for value in fractions)]]
 
 
 def spread(photographs: Photographs, count: int) -> Mask:
@@ -380,12 +403,15 @@ def spread(photographs: Photographs, count: int) -> Mask:
     return chosen
 
 
-def _errors_at(photographs: Photographs, fitted: Fitted, known: Mask) -> str:
-    """Mean angle and prediction error at some pixels."""
-    angle = np.nanmean(angles(fitted.normal, photographs.normal)[known])
+def _errors_at(
+    photographs: Photographs, fitted: Fitted, known: Mask
+) -> tuple[float, float]:
+    """Mean angle, NaN without measured normals, and prediction error at some pixels."""
+    angle = np.nan
+    if photographs.normal is not None:
+        angle = float(np.nanmean(angles(fitted.normal, photographs.normal)[known]))
     predicted = np.where(known[:, None], fitted.predicted, np.nan)
-    error = prediction_error(photographs, predicted, photographs.held_out)
-    return f"{angle:.1f} / {error:.1f}"
+    return angle, prediction_error(photographs, predicted, photographs.held_out)
 
 
 def sphere_rows(photographs: Photographs) -> list[list[str]]:
@@ -439,6 +465,7 @@ def measure(data: Path, part: str) -> list[list[str]] | str:
         "faces": photometric / "yale" / "yaleB12.npz",
         "cat": photometric / "diligent" / "cat.npz",
         "lights": photometric / "diligent" / "cat.npz",
+        "face-lights": photometric / "yale" / "yaleB12.npz",
         "sphere": photometric / "uw" / "light_directions_chrome.csv",
         "brdfs": data / "brdf" / "merl_slices_phid90.npz",
         "exposures": data / "exposures" / "memorial",
@@ -452,7 +479,9 @@ def measure(data: Path, part: str) -> list[list[str]] | str:
     if part == "cat":
         return cat_rows(cat(needed.parent))
     if part == "lights":
-        return light_rows(cat(needed.parent))
+        return light_rows([cat(needed.parent)])
+    if part == "face-lights":
+        return light_rows(with_lights_of_others(faces(needed.parent)))
     if part == "sphere":
         return sphere_rows(gray_sphere(needed.parent))
     if part == "exposures":
