@@ -29,7 +29,7 @@ DIMS = set(
     "group k take edge bin trait side level status samples space statistic "
     "contrast quantity attribute attribute_2 "
     "part cell chromophore pair take_2 placement pressure_sample step "
-    "response_level exposure".split()
+    "response_level exposure correction".split()
 )
 
 
