@@ -22,24 +22,25 @@ MIDDLE_FRACTION = 0.15
 # of points over their length, below which they lie on a line and do not determine a
 # rotation
 MIN_WIDTH = 0.15
-# positions in mm on a mean face that looks along +z, y up: the virtual head of average
-# proportions, rounded. The subject's left is mirrored.
+# positions in mm on a mean face that looks along +z, y up: the mean of the virtual head of
+# average proportions and of 40 random adults of ICT FaceKit (Li et al. 2020, a model of
+# scanned people), with the same nose tip, rounded. The subject's left is mirrored.
 _MIDDLE = {
-    "forehead_centre": (0, 96, 96),
-    "nasion": (0, 42, 106),
+    "forehead_centre": (0, 99, 92),
+    "nasion": (0, 42, 103),
     NOSE: (0, 8, 125),
-    "subnasale": (0, -10, 107),
-    "lip_upper": (0, -30, 113),
-    "chin": (0, -72, 101),
+    "subnasale": (0, -9, 108),
+    "lip_upper": (0, -26, 112),
+    "chin": (0, -71, 98),
 }
 _OF_RIGHT = {
-    "forehead": (-46, 88, 80),
-    "brow": (-37, 59, 93),
-    "ala": (-16, -5, 107),
-    "eye_outer": (-44, 32, 85),
-    "eye_inner": (-17, 32, 90),
-    "mouth_corner": (-25, -36, 97),
-    "jaw": (-57, -55, 37),
+    "forehead": (-48, 91, 75),
+    "brow": (-38, 63, 92),
+    "ala": (-14, -6, 104),
+    "eye_outer": (-44, 35, 82),
+    "eye_inner": (-17, 34, 87),
+    "mouth_corner": (-25, -33, 95),
+    "jaw": (-55, -53, 41),
 }
 MEAN_FACE: Mapping[str, Float64] = {
     name: np.array(place, np.float64)

@@ -65,12 +65,12 @@ def test_suggest_landmarks__names_exactly_those_that_are_not_set(heads):
 def test_suggest_landmarks__come_nearer_as_points_are_set(heads):
     none = np.concatenate([[*errors(head, ()).values()] for head in heads])
     seven = np.concatenate([[*errors(head, SEVEN).values()] for head in heads])
-    # measured once on these heads: median 4.9 and 1.3 mm, largest 10.9 and 3.9 mm, the
-    # variation of their proportions
-    assert np.median(none) < 6
-    assert none.max() < 13
-    assert np.median(seven) < 1.6
-    assert seven.max() < 5
+    # measured on these heads: median 4.1 and 2.3 mm, largest 16.3 and 9.6 mm. The mean
+    # face is half that of scanned people; that of virtual heads alone has 4.9 mm
+    assert np.median(none) < 4.6
+    assert none.max() < 18
+    assert np.median(seven) < 2.6
+    assert seven.max() < 11
 
 
 def test_suggest_landmarks__mirrors_a_point_whose_mate_is_set(heads):
