@@ -39,7 +39,7 @@ from skindb.types import Array
 
 # Strength of the lobe over the median R_d. The first was chosen on four faces of Extended
 # Yale B; it is also the best of six for the four others and, among lobes of this width, for
-# the cat of DiLiGenT (docs/validation.md). Under few lights samples that are left out tell
+# the cat of DiLiGenT (docs/validation.md). Under few lights held-out samples tell
 # little: another strength must predict them better by `MIN_GAIN`, as for a matt surface or a
 # smooth one above an ideal matt body (planted skin: by 0.16 to 0.6).
 STRENGTHS = (16.0, 4.0, 1.0, 0.25)
@@ -104,7 +104,7 @@ def _spread(size: int, count: int) -> Array:
 def _left_out_error(
     part: xr.Dataset, prior: Gloss, eta: float, scan_error: float
 ) -> float:
-    """Median relative error of samples of lights that are left out in turn."""
+    """Median relative error of the samples of lights that are held out in turn."""
     prior = prior._replace(samples=MIN_SAMPLES_LAMBERT)
     arrays = {str(name): part[name].values for name in part.data_vars}
     comparison = Comparison(
