@@ -38,7 +38,7 @@ from skindb.reflectance.model import MIN_LOBE_WIDTH, Comparison
 from skindb.types import Array
 
 # Strength of the lobe over the median R_d. The first was chosen on four faces of Extended
-# Yale B; it is also the best of six for the four others and, among lobes of this width, for
+# Yale B; of five up to it, it is also the best for the four others and, at this width, for
 # the cat of DiLiGenT (docs/validation.md). Under few lights held-out samples tell
 # little: another strength must predict them better by `MIN_GAIN`, as for a matt surface or a
 # smooth one above an ideal matt body (planted skin: by 0.16 to 0.6).
