@@ -4,13 +4,10 @@ lights, or light-stage folders with one picture for each light and camera.
 
 from __future__ import annotations
 
-import io
 import json
 import re
 import shutil
-import struct
 import unicodedata
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,33 +16,30 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import imagecodecs
 import numpy as np
-import tifffile
-from PIL import ExifTags, Image, ImageOps
-from scipy.spatial.transform import Rotation
 
 from skindb.calibration.lights import ball_outline, distant_light, highlight_centre
-from skindb.errors import Fault, InputError, attempt, input_error, require
+from skindb.errors import Fault, InputError, attempt, require
 from skindb.files import make_private, private_file, read_regular
 from skindb.format.dome import EXPOSURE_RATIO
-from skindb.format.fields import IDENTIFIER, Fields, read_json, short
+from skindb.format.fields import IDENTIFIER, Fields, short
 from skindb.format.folder import FORMAT, record_faults
-from skindb.format.frames import read_frame, write_frame
+from skindb.format.frames import write_frame
 from skindb.format.sensor import read_response
+from skindb.ingest.light_tables import Light, read_lights
+from skindb.ingest.picture_files import (
+    FORMATS,
+    SUFFIXES,
+    exif_exposure,
+    read_picture,
+)
+from skindb.ingest.stage_cameras import read_cameras
 from skindb.limits import (
-    MAX_CAMERAS,
-    MAX_FRAME_BYTES,
-    MAX_FRAME_PIXELS,
-    MAX_LIGHTS,
     MAX_SCAN_BYTES,
 )
 from skindb.parameters import ImportParameters
-from skindb.types import AnyArray, Float64, Mask, Progress, silent
+from skindb.types import Mask, Progress, silent
 
-Picture = AnyArray  # (h, w, 3) uint8, uint16, or float radiance
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".exr")
-FORMATS = "PNG, TIFF, JPEG, BMP or OpenEXR"
 CAMERA = "c00"
 # mm; distance of a camera whose lens is not known: perspective is below a hundredth
 CAMERA_DISTANCE_MM = 10_000.0
@@ -53,27 +47,13 @@ CAMERA_DISTANCE_MM = 10_000.0
 WHITE_REFLECTANCE = 0.5
 # of the radiances of linear files, which takes the place of the white level
 BRIGHT_QUANTILE = 0.999
-MAX_TABLE_BYTES = 4 << 20
 MASK = re.compile(r"(?<![a-z])mask(?![a-z])")
-COLUMNS = ("x", "y", "z")
-# of a file of lights; positions are in mm
-POSITION_COLUMNS = ("x_mm", "y_mm", "z_mm")
 PATTERNS = (
     "{camera}/{light}",
     "{light}/{camera}",
     "{camera}_{light}",
     "{light}_{camera}",
 )
-
-
-@dataclass(frozen=True)
-class Light:
-    """A light of a table: the picture it belongs to, and where it is."""
-
-    name: str
-    vector: Float64  # (3,) direction, or position in mm
-    distant: bool
-    gain: float = 1.0  # relative intensity
 
 
 @dataclass(frozen=True)
@@ -200,7 +180,7 @@ def import_olat(
     chosen = _parameters(parameters, "a light stage", "mirror_ball", "mask", "width_mm")
     _require_writable(out, person)
     table = read_lights(_table_file(source, chosen.lights))
-    devices = _read_cameras(source, chosen.cameras)
+    devices = read_cameras(source, chosen.cameras)
     names = [light.name for light in table]
     pattern, files = _olat_files(source, names, [str(c["id"]) for c in devices])
     frames = _Frames(out, next(iter(files.values())), chosen.response)
@@ -346,7 +326,7 @@ class _Frames:
         make_private(target.parent)
         write_frame(target, picture)
         self.newest = max(self.newest, file.stat().st_mtime)
-        exposure, automatic_white = _exif(file)
+        exposure, automatic_white = exif_exposure(file)
         self.automatic_white |= automatic_white
         if exposure > 0:
             self.exposures.setdefault(exposure, file.name)
@@ -409,201 +389,6 @@ class _Frames:
         for name, value in (("dome/dome.json", dome), ("capture.json", record)):
             text = json.dumps(value, indent=1)
             private_file(self.out / name).write_text(text, encoding="utf-8")
-
-
-def read_lights(path: Path) -> list[Light]:
-    """Lights of a CSV or RTI .lp file, in its order.
-
-    Values are separated by commas, semicolons, tabs or spaces. Without a header, a line is a
-    name and a direction; a header names columns: the first one is the picture, `x, y, z`
-    a direction or `x_mm, y_mm, z_mm` a position, `intensity` a relative intensity.
-
-    Raises
-    ------
-    InputError
-        With every line that is not a light, and names that are given twice.
-    """
-    try:
-        text = read_regular(path, MAX_TABLE_BYTES).decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise _table_fault(path, "must be UTF-8 text", "another encoding") from None
-    faults = list[Fault]()
-    found = list[Light]()
-    header = list[str]()
-    for number, line in enumerate(text.splitlines(), 1):
-        words = _words(line)
-        if not words or (not found and len(words) == 1 and words[0].isdigit()):
-            continue  # .lp files begin with the number of pictures
-        values = _numbers(words[1:])
-        if not found and not header and any(value is None for value in values[-3:]):
-            header = [word.lower() for word in words]
-            continue
-        place = f"{path}, line {number}"
-        light = attempt(faults, partial(_table_light, words, header, place))
-        if light is not None:
-            found.append(light)
-    names = [light.name for light in found]
-    for name in sorted({name for name in names if names.count(name) > 1}):
-        faults.append(
-            Fault(
-                str(path),
-                "a picture must have one light",
-                f"{short(name)} twice",
-                "remove the lines that do not apply",
-            )
-        )
-    if faults:
-        raise InputError(faults)
-    if not 1 <= len(found) <= MAX_LIGHTS:
-        raise _table_fault(
-            path, f"must have 1 to {MAX_LIGHTS:,} lights", f"{len(found)} lights"
-        )
-    return found
-
-
-def read_picture(path: Path) -> Picture:
-    """A picture (h, w, 3) as it is looked at: uint8, uint16 or float radiance; grey is
-    repeated, transparency dropped, and the orientation of JPEG files applied.
-
-    Raises
-    ------
-    InputError
-        If it is not a whole picture of a known format.
-    """
-    if path.suffix.lower() == ".exr":
-        return read_frame(path)
-    content = read_regular(path, MAX_FRAME_BYTES)
-    try:
-        # by its content, as names may be wrong
-        if content.startswith(b"\x89PNG"):
-            picture = np.asarray(imagecodecs.png_decode(content))
-        elif content[:4] in (b"II*\0", b"MM\0*"):
-            picture = _tiff(content)
-        else:
-            with Image.open(io.BytesIO(content), formats=("JPEG", "BMP")) as image:
-                picture = np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
-        if picture.ndim == 2:
-            picture = picture[..., None]
-        height, width, _ = picture.shape
-        if height * width > MAX_FRAME_PIXELS:
-            raise ValueError(
-                f"{width} x {height} pixels, more than {MAX_FRAME_PIXELS:,}"
-            )
-        if picture.dtype not in (np.uint8, np.uint16):
-            raise ValueError(f"values of {picture.dtype}, not of 8 or 16 bits")
-    except (ValueError, RuntimeError, OSError, Image.DecompressionBombError) as error:
-        raise input_error(
-            str(path),
-            f"a picture must be a whole {FORMATS} file",
-            short(str(error)),
-            "export it as PNG, JPEG or plain TIFF; raw and HEIC files have to be converted",
-        ) from None
-    if picture.shape[2] < 3:
-        picture = np.repeat(picture[..., :1], 3, axis=2)
-    return np.array(picture[..., :3])
-
-
-def _exif(path: Path) -> tuple[float, bool]:
-    """Exposure by EXIF, seconds x ISO / (100 x f-number^2), 0 if it is not stated; and
-    whether the camera chose the white balance.
-    """
-    base = ExifTags.Base
-    try:
-        with (
-            warnings.catch_warnings(action="ignore"),
-            Image.open(path, formats=("JPEG", "PNG", "TIFF")) as image,
-        ):
-            tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
-        exposure = (
-            float(tags.get(base.ExposureTime, 0))
-            * float(tags.get(base.ISOSpeedRatings, 100) or 100)
-            / (100 * float(tags.get(base.FNumber, 1) or 1) ** 2)
-        )
-    except (OSError, ValueError, TypeError, SyntaxError, ArithmeticError, struct.error):
-        return 0.0, False  # faulty tags are no faults of the picture
-    return (exposure if 0 < exposure < np.inf else 0.0), tags.get(
-        base.WhiteBalance
-    ) == 0
-
-
-def _tiff(content: bytes) -> Picture:
-    """The only page of a TIFF; `ValueError` for what would be read wrongly."""
-    with tifffile.TiffFile(io.BytesIO(content)) as file:
-        page = file.pages[0]
-        orientation = page.tags.get("Orientation")
-        wrong = {
-            "several pages": len(file.pages) > 1,
-            "a palette or inverted values": page.photometric
-            not in (tifffile.PHOTOMETRIC.RGB, tifffile.PHOTOMETRIC.MINISBLACK),
-            "separate planes": page.ndim > 2 and page.planarconfig != 1,
-            "a turned picture": orientation is not None and orientation.value != 1,
-        }
-        if found := [what for what, is_so in wrong.items() if is_so]:
-            raise ValueError(", ".join(found))
-        return np.asarray(page.asarray())
-
-
-def _words(line: str) -> list[str]:
-    """Cells of a line of a table; a name in front may contain spaces."""
-    line = re.sub(r"(^|\s)#.*", "", line).strip()  # names may contain the sign
-    for separator in (";", "\t", ","):
-        if separator in line:
-            cells = [cell.strip().strip('"') for cell in line.split(separator)]
-            if separator == ",":
-                return cells
-            # numbers with decimal commas
-            return [cells[0], *(cell.replace(",", ".") for cell in cells[1:])]
-    words = line.split()
-    front = len(words)
-    while front > 1 and _numbers(words[front - 1 : front])[0] is not None:
-        front -= 1
-    if front == 1 or front == len(words):
-        return words
-    return [" ".join(words[:front]), *words[front:]]
-
-
-def _numbers(words: Sequence[str]) -> list[float | None]:
-    values: list[float | None] = []
-    for word in words:
-        try:
-            values.append(float(word))
-        except ValueError:
-            values.append(None)
-    return values
-
-
-def _table_light(words: Sequence[str], header: Sequence[str], place: str) -> Light:
-    """The light of a line."""
-    columns = header or ("picture", *COLUMNS)
-    require(
-        not any(words[len(columns) :]),
-        place,
-        f"must have {len(columns)} cells: {', '.join(columns)}",
-        short(", ".join(words)),
-        "name further columns in a header; write decimal points, or separate by semicolons",
-    )
-    cells = dict(zip(columns, words, strict=False))
-    name = re.split(r"[\\/]", words[0])[-1]
-    distant = not set(POSITION_COLUMNS) <= set(cells)
-    values = _numbers(
-        [cells.get(key, "") for key in (COLUMNS if distant else POSITION_COLUMNS)]
-    )
-    gain = _numbers([cells.get("intensity", "1")])[0]
-    vector = np.array([np.nan if value is None else value for value in values])
-    usable = np.isfinite(vector).all() and np.linalg.norm(vector) > 0
-    require(
-        bool(name) and bool(usable) and gain is not None and 0 < gain < np.inf,
-        place,
-        "must be a picture and the direction x, y, z to its light (or x_mm, y_mm, z_mm "
-        "of a header); an intensity is positive",
-        short(", ".join(words)),
-        "correct the line",
-    )
-    return Light(name, vector, distant, float(gain or 1.0))
-
-
-def _table_fault(path: Path, rule: str, found: str) -> InputError:
-    return input_error(str(path), f"a table of lights {rule}", found, "correct it")
 
 
 def _table_file(source: Path, given: Path | None) -> Path:
@@ -797,106 +582,6 @@ def _srgb_table(count: int) -> str:
         f"{v},{e:.9g},{e:.9g},{e:.9g}" for v, e in zip(value, exposure, strict=True)
     ]
     return "\n".join(["dn,r,g,b", *rows]) + "\n"
-
-
-def _read_cameras(source: Path, given: Path | None) -> list[dict[str, Any]]:
-    """Cameras of a JSON file, or of the text files of COLMAP."""
-    path = given or (
-        source / "cameras.json" if (source / "cameras.json").exists() else source
-    )
-    if path.is_dir():
-        return _colmap_cameras(path)
-    faults = list[Fault]()
-    data = read_json(path, faults)
-    fields = Fields(
-        {"cameras": data} if isinstance(data, list) else data, str(path), faults
-    )
-    items = [] if faults else fields.items("cameras", maximum=MAX_CAMERAS)
-    for item in items:
-        item.text("id")
-        for key, shape in (("K", (3, 3)), ("R", (3, 3)), ("t", (3,))):
-            item.array(key, shape)
-        for key in ("width", "height"):
-            if item.has(key):
-                item.integer(key, minimum=1)
-    if faults:
-        raise InputError(faults)
-    keys = ("id", "width", "height", "K", "R", "t", "distortion")
-    return [
-        {key: item[key] for key in keys if key in item}
-        for item in fields.data["cameras"]
-    ]
-
-
-def _colmap_cameras(folder: Path) -> list[dict[str, Any]]:
-    """Cameras of cameras.txt and images.txt; images are named after the cameras."""
-    tables = {name: folder / f"{name}.txt" for name in ("cameras", "images")}
-    require(
-        all(path.exists() for path in tables.values()),
-        str(folder),
-        "cameras must be in cameras.json, or in cameras.txt and images.txt of COLMAP",
-        "neither",
-        "export the model of COLMAP as text, or write cameras.json",
-    )
-    place = str(tables["cameras"])
-    lenses = {}
-    found = list[dict[str, Any]]()
-    try:
-        lines = {
-            name: [
-                line.split()
-                for line in read_regular(path, MAX_SCAN_BYTES).decode().splitlines()
-                if not line.startswith("#")
-            ]
-            for name, path in tables.items()
-        }
-        for number, model, width, height, *values in filter(None, lines["cameras"]):
-            lens = _colmap_lens(model, [float(value) for value in values], place)
-            lenses[number] = {"width": int(width), "height": int(height), **lens}
-        place = str(tables["images"])
-        rows = iter(lines["images"])
-        for words in rows:
-            if not words:
-                continue
-            _, *pose, number, name = words
-            w, x, y, z, *t = map(float, pose)
-            # of points, x y id; empty without any
-            if len(points := next(rows, [])) % 3 or None in _numbers(points):
-                raise ValueError("an image must be followed by a line of its points")
-            camera = Path(name).parts[0] if "/" in name else Path(name).stem
-            if camera in [record["id"] for record in found]:
-                raise ValueError(f"two images of camera {camera}")
-            rotation = Rotation.from_quat([x, y, z, w]).as_matrix().tolist()
-            found.append({"id": camera, **lenses[number], "R": rotation, "t": t})
-    except InputError:
-        raise
-    except (ValueError, KeyError) as error:
-        raise input_error(
-            place,
-            "must be a text model of COLMAP, with one image for each camera",
-            short(str(error)),
-            "export the model as text again",
-        ) from None
-    return found
-
-
-def _colmap_lens(model: str, v: Sequence[float], place: str) -> dict[str, Any]:
-    """K and distortion k1 k2 p1 p2 k3 of a camera model of COLMAP."""
-    if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
-        focal, cx, cy, *radial = v
-        K = [[focal, 0, cx], [0, focal, cy], [0, 0, 1]]
-        lens = [*radial, 0.0, 0.0][:2]
-        return {"K": K, "distortion": [*lens, 0.0, 0.0, 0.0]}
-    if model in ("PINHOLE", "OPENCV"):
-        fx, fy, cx, cy, *lens = v
-        K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
-        return {"K": K, "distortion": [*(lens or [0.0] * 4), 0.0]}
-    raise input_error(
-        place,
-        "the camera model must be SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV",
-        model,
-        "undistort the pictures with COLMAP",
-    )
 
 
 def _is_file(name: str) -> bool:

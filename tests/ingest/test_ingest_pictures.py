@@ -33,7 +33,8 @@ from skindb.ingest import (
     ingest_capture,
     read_capture,
 )
-from skindb.ingest.pictures import _exif, read_lights, read_picture
+from skindb.ingest.light_tables import read_lights
+from skindb.ingest.picture_files import exif_exposure, read_picture
 
 PERSON = {"subject": "P1", "consent": {"scope": ["fit"], "reference": "form 1"}}
 LIGHTS = directions(9)
@@ -258,11 +259,11 @@ def test_damaged_exif_states_nothing(tmp_path: Path) -> None:
     (name,) = write_photographs(tmp_path, [0.01], LIGHTS[:1])
     path = tmp_path / name
     whole = path.read_bytes()
-    assert _exif(path) == (pytest.approx(0.005), True)
+    assert exif_exposure(path) == (pytest.approx(0.005), True)
     begin = whole.index(b"Exif")
     for place in range(begin + 6, begin + 60):
         path.write_bytes(whole[:place] + b"\xff" + whole[place + 1 :])
-        exposure, _ = _exif(path)  # which neither fails nor warns
+        exposure, _ = exif_exposure(path)  # which neither fails nor warns
         assert 0 <= exposure < np.inf
 
 

@@ -1,0 +1,146 @@
+"""Tables of lights: CSV, and .lp files of reflectance transformation imaging."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from skindb.errors import Fault, InputError, attempt, input_error, require
+from skindb.files import read_regular
+from skindb.format.fields import short
+from skindb.limits import MAX_LIGHTS
+from skindb.types import Float64
+
+MAX_TABLE_BYTES = 4 << 20
+COLUMNS = ("x", "y", "z")
+# of a file of lights; positions are in mm
+POSITION_COLUMNS = ("x_mm", "y_mm", "z_mm")
+
+
+@dataclass(frozen=True)
+class Light:
+    """A light of a table: the picture it belongs to, and where it is."""
+
+    name: str
+    vector: Float64  # (3,) direction, or position in mm
+    distant: bool
+    gain: float = 1.0  # relative intensity
+
+
+def read_lights(path: Path) -> list[Light]:
+    """Lights of a CSV or RTI .lp file, in its order.
+
+    Values are separated by commas, semicolons, tabs or spaces. Without a header, a line is a
+    name and a direction; a header names columns: the first one is the picture, `x, y, z`
+    a direction or `x_mm, y_mm, z_mm` a position, `intensity` a relative intensity.
+
+    Raises
+    ------
+    InputError
+        With every line that is not a light, and names that are given twice.
+    """
+    try:
+        text = read_regular(path, MAX_TABLE_BYTES).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise _table_fault(path, "must be UTF-8 text", "another encoding") from None
+    faults = list[Fault]()
+    found = list[Light]()
+    header = list[str]()
+    for number, line in enumerate(text.splitlines(), 1):
+        words = _words(line)
+        if not words or (not found and len(words) == 1 and words[0].isdigit()):
+            continue  # .lp files begin with the number of pictures
+        values = numbers(words[1:])
+        if not found and not header and any(value is None for value in values[-3:]):
+            header = [word.lower() for word in words]
+            continue
+        place = f"{path}, line {number}"
+        light = attempt(faults, partial(_table_light, words, header, place))
+        if light is not None:
+            found.append(light)
+    names = [light.name for light in found]
+    for name in sorted({name for name in names if names.count(name) > 1}):
+        faults.append(
+            Fault(
+                str(path),
+                "a picture must have one light",
+                f"{short(name)} twice",
+                "remove the lines that do not apply",
+            )
+        )
+    if faults:
+        raise InputError(faults)
+    if not 1 <= len(found) <= MAX_LIGHTS:
+        raise _table_fault(
+            path, f"must have 1 to {MAX_LIGHTS:,} lights", f"{len(found)} lights"
+        )
+    return found
+
+
+def _words(line: str) -> list[str]:
+    """Cells of a line of a table; a name in front may contain spaces."""
+    line = re.sub(r"(^|\s)#.*", "", line).strip()  # names may contain the sign
+    for separator in (";", "\t", ","):
+        if separator in line:
+            cells = [cell.strip().strip('"') for cell in line.split(separator)]
+            if separator == ",":
+                return cells
+            # numbers with decimal commas
+            return [cells[0], *(cell.replace(",", ".") for cell in cells[1:])]
+    words = line.split()
+    front = len(words)
+    while front > 1 and numbers(words[front - 1 : front])[0] is not None:
+        front -= 1
+    if front == 1 or front == len(words):
+        return words
+    return [" ".join(words[:front]), *words[front:]]
+
+
+def numbers(words: Sequence[str]) -> list[float | None]:
+    """Numbers of cells; None for what is no number."""
+    values: list[float | None] = []
+    for word in words:
+        try:
+            values.append(float(word))
+        except ValueError:
+            values.append(None)
+    return values
+
+
+def _table_light(words: Sequence[str], header: Sequence[str], place: str) -> Light:
+    """The light of a line."""
+    columns = header or ("picture", *COLUMNS)
+    require(
+        not any(words[len(columns) :]),
+        place,
+        f"must have {len(columns)} cells: {', '.join(columns)}",
+        short(", ".join(words)),
+        "name further columns in a header; write decimal points, or separate by semicolons",
+    )
+    cells = dict(zip(columns, words, strict=False))
+    name = re.split(r"[\\/]", words[0])[-1]
+    distant = not set(POSITION_COLUMNS) <= set(cells)
+    values = numbers(
+        [cells.get(key, "") for key in (COLUMNS if distant else POSITION_COLUMNS)]
+    )
+    gain = numbers([cells.get("intensity", "1")])[0]
+    vector = np.array([np.nan if value is None else value for value in values])
+    usable = np.isfinite(vector).all() and np.linalg.norm(vector) > 0
+    require(
+        bool(name) and bool(usable) and gain is not None and 0 < gain < np.inf,
+        place,
+        "must be a picture and the direction x, y, z to its light (or x_mm, y_mm, z_mm "
+        "of a header); an intensity is positive",
+        short(", ".join(words)),
+        "correct the line",
+    )
+    return Light(name, vector, distant, float(gain or 1.0))
+
+
+def _table_fault(path: Path, rule: str, found: str) -> InputError:
+    return input_error(str(path), f"a table of lights {rule}", found, "correct it")
