@@ -374,6 +374,7 @@ def light_rows(objects: list[Photographs]) -> list[list[str]]:
         title = f"{len(objects)} faces, lights by the others: held-out lights [%]"
     rows = [[title, *(f"{n} lights" for n in LIGHT_COUNTS)]]
     known = dict[tuple[str, int], Mask]()
+    covered = []
     for name, method in methods(SKIN).items():
         cells = []
         for count in LIGHT_COUNTS:
@@ -383,6 +384,9 @@ def light_rows(objects: list[Photographs]) -> list[list[str]]:
                 key = (photographs.name, count)
                 if name == "skindb":
                     known[key] = np.isfinite(fitted.predicted).any(axis=1)
+                    if measured:
+                        angle = angles(fitted.normal, photographs.normal)
+                        covered.append(coverage(fitted, angle))
                 errors.append(_errors_at(photographs, fitted, known[key]))
             angle, error = np.mean(errors, axis=0)
             cells.append(f"{angle:.1f} / {error:.1f}" if measured else f"{error:.1f}")
@@ -391,8 +395,13 @@ def light_rows(objects: list[Photographs]) -> list[list[str]]:
         100 * np.mean([known[o.name, count].mean() for o in objects])
         for count in LIGHT_COUNTS
     ]
-    label = "pixels with a model of skindb [%]"
-    return [*rows, [label, *(f"{value:.0f}" for value in fractions)]]
+    rows.append(
+        [
+            "pixels with a model of skindb [%]",
+            *(f"{value:.0f}" for value in fractions),
+        ]
+    )
+    return [*rows, ["normals of skindb " + COVERAGE, *covered]] if measured else rows
 
 
 def spread(photographs: Photographs, count: int) -> Mask:

@@ -219,7 +219,8 @@ def test_few_samples__errors_are_wider_for_fewer(small_dictionary):
         lumitexels, _ = _planted(_lights(count), gloss=STRENGTH / 2, noise=0.02)
         fitted = _fitted(lumitexels, small_dictionary)
         medians.append([float(np.median(fitted[name])) for name in errors])
-    assert (np.array(medians[0]) > 1.5 * np.array(medians[1])).all()
+    # the factor of the total error of normals is the root of the number
+    assert (np.array(medians[0]) > np.array([1.5, 1.2, 1.5]) * medians[1]).all()
 
 
 def test_few_samples__lights_in_a_plane_need_a_scan(small_dictionary):
