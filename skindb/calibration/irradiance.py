@@ -4,7 +4,7 @@ white target (Weyrich et al. 2005, section 5).
 
 from collections.abc import Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -187,8 +187,10 @@ def _intensities(
         return np.zeros((0, 3))
     frames = checked_white_view(dome, light.id, merger, digests=digests)
     radiance, flag = merger.merge(frames, target.spans)
-    square, falloff = light_falloff(light, target.points)
-    towards = (light.position - target.points) @ white.normal
+    # gains of a calibration from takes are relative to what the stated position gives
+    stated = replace(light, position=light.position - np.array(light.offset))
+    square, falloff = light_falloff(stated, target.points)
+    towards = (stated.position - target.points) @ white.normal
     cosine = falloff * towards / np.sqrt(square)
     usable = (cosine > MIN_COSINE_TARGET) & (flag.ravel()[target.at] == OK)
     factor = np.pi / white.reflectance * square[usable] / cosine[usable]

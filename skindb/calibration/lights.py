@@ -59,6 +59,7 @@ THREADS = 2
 SAME_POSITION_MM = 1.0
 SAME_ANGLE = float(np.radians(0.1))
 SAME_FRACTION = 0.8  # a few lamps may have failed
+MIN_SHARED = 3  # lights; one or two of two rigs may have the same places
 
 
 @dataclass(frozen=True)
@@ -483,14 +484,13 @@ def calibrated_dome(
 def is_same_rig(
     positions: Mapping[str, Float64], others: Mapping[str, Float64]
 ) -> bool:
-    """Whether two sets of lights are of one rig, see `moved_lights`: at least 80 % of
-    the smaller set are in both, and none of these is elsewhere.
+    """Whether two sets of lights are of one rig, see `moved_lights`: at least three,
+    and 80 % of the smaller set, are in both, and none of these is elsewhere.
     """
     shared = positions.keys() & others.keys()
     smaller = min(len(positions), len(others))
-    return len(shared) >= SAME_FRACTION * smaller > 0 and not moved_lights(
-        positions, others
-    )
+    enough = len(shared) >= max(MIN_SHARED, SAME_FRACTION * smaller)
+    return enough and not moved_lights(positions, others)
 
 
 def moved_lights(

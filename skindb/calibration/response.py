@@ -217,7 +217,9 @@ def _fit_channel(
     samples that did not move.
     """
     value = samples.value
-    smoothness = options.smoothness or FIRST_SMOOTHNESS
+    smoothness = options.smoothness
+    if smoothness is None:
+        smoothness = FIRST_SMOOTHNESS
     for _ in range(MEANS):
         solution, _, _ = _fit_values(samples, value, smoothness, options.knots)
         value = _mean_exposure_value(samples.pixels, solution, options.knots)

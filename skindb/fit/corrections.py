@@ -155,8 +155,10 @@ class LightResiduals:
         unseen = np.isnan(errors.gain) | (
             np.diagonal(self.form)[: len(errors.gain)] == 0
         )
-        inverse = np.where(unseen, 1.0, self.applied.gain / errors.gain)
-        inverse /= np.median(inverse)
+        inverse = np.ones(len(unseen))
+        if not unseen.all():
+            known = (self.applied.gain / errors.gain)[~unseen]
+            inverse[~unseen] = known / np.median(known)
         move = np.where(unseen[:, None], 0.0, errors.offset - self.applied.offset)
         square = np.square(self.axes).sum(axis=2)
         turns = np.einsum("ilk,lk->il", self.axes, move) / square

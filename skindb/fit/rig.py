@@ -60,8 +60,8 @@ def common_light_errors(
     -------
     Dataset
         Group "rig_calibration". The spreads are NaN if no light has three takes. Offsets
-        are 0 unless with them the other takes predict a held-out take better than with
-        gains alone.
+        are those that were applied, or else 0, unless with new ones the other takes
+        predict a held-out take better than with gains alone.
     """
     none = LightErrors(np.ones(len(lights)), np.zeros(positions.shape))
     commons = [Common([take.errors(turned=x) for take in takes]) for x in (False, True)]
@@ -84,9 +84,11 @@ def common_light_errors(
             variables.RIG_LIGHT_GAIN: common.errors.gain,
             variables.RIG_LIGHT_GAIN_ERROR: common.errors.gain * common.log_error,
             variables.RIG_LIGHT_OFFSET: common.errors.offset,
-            variables.RIG_LIGHT_ANGLE_ERROR: np.degrees(common.offset_error / distance)
-            if turned
-            else np.full(len(lights), np.nan),
+            variables.RIG_LIGHT_ANGLE_ERROR: np.where(
+                np.any(common.errors.offset != 0, axis=1),
+                np.degrees(commons[1].offset_error / distance),
+                np.nan,
+            ),
             variables.RIG_TAKES: common.takes,
             variables.RIG_SPREAD: _median_spread(gains),
             variables.RIG_SPREAD_LEFT: _median_spread(gains - commons[0].others_logs),

@@ -109,7 +109,7 @@ def dome_group(dome: DomeRecord, intensity: Float64) -> xr.Dataset:
         "camera_distortion": [camera.distortion for camera in cameras],
         "camera_size": [(camera.width, camera.height) for camera in cameras],
     }
-    if any(light.gain != 1 for light in lights):
+    if any(light.gain != 1 or any(light.offset) for light in lights):
         variables["light_gain_applied"] = [light.gain for light in lights]
         variables["light_offset_applied"] = [light.offset for light in lights]
     by_light = [light.polarisation for light in lights]

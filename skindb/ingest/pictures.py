@@ -370,10 +370,15 @@ class _Frames:
                 f"radiance {white:g} is taken as white: takes with another one cannot be compared"
             )
         # what white has depends on it
-        exposure = float(np.median([*self.exposures] or [float(self.linear)])) / white
+        records = _light_records(lights, ids, white)
+        # different exposures are part of the stated intensities
+        exposure = (low or float(self.linear)) if same else 1.0
+        exposure *= (
+            lights[0].gain * np.pi / WHITE_REFLECTANCE / records[0]["intensity"][0]
+        )
         dome = {
             "cameras": cameras,
-            "lights": _light_records(lights, ids, white),
+            "lights": records,
             "relative": True,
             "exposures": [{"id": "e0", "seconds": 1.0}],
             "frames": f"dome/frames/{{light}}_{{camera}}{self.suffix}",

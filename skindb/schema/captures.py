@@ -281,7 +281,7 @@ RIG_LIGHT_GAIN_ERROR = declare(
 RIG_LIGHT_OFFSET = declare(
     "float64 rig_calibration/rig_light_offset(light, xyz) [mm]",
     "true minus stated position across the direction to the light, median over the "
-    "takes; 0 if those of other takes do not predict a take",
+    "takes; those applied, or else 0, if those of other takes do not predict a take",
 )
 RIG_LIGHT_ANGLE_ERROR = declare(
     "float64 rig_calibration/rig_light_angle_error(light) [degree]",

@@ -212,6 +212,13 @@ def _require_help(group: xr.Dataset) -> None:
     spread = float(group[variables.RIG_SPREAD])
     left = float(group[variables.RIG_SPREAD_LEFT])
     require(
+        np.isfinite(spread),
+        "calibration from takes",
+        f"{MIN_TAKES} takes must have lights in common that their models see",
+        "none",
+        "fit takes with more samples",
+    )
+    require(
         left < spread,
         "calibration from takes",
         "common gains must lower the spread of the lights in a held-out take",

@@ -230,7 +230,12 @@ def test_light_intensities__are_multiplied_by_the_gain_of_the_light(pristine, so
     if source == "relative":
         dome = replace(dome, white=None)
     gains = np.linspace(0.8, 1.3, len(dome.lights))
-    lights = (replace(x, gain=g) for x, g in zip(dome.lights, gains, strict=True))
+    # gains are relative to the intensity that the stated position gives
+    offset = np.array([0.0, 30.0, 0.0]) * (source == "white target")
+    lights = (
+        replace(x, gain=g, position=x.position + offset, offset=tuple(offset))
+        for x, g in zip(dome.lights, gains, strict=True)
+    )
     brighter = replace(dome, lights=tuple(lights))
     with ThreadPoolExecutor(2) as pool:
         plain, changed = (

@@ -102,3 +102,21 @@ def test_common_light_errors__turned_lights_are_found_and_others_stay(
     assert both < alone < 0.6 or degrees == 0
     known = np.isfinite(group["rig_light_angle_error"].values)
     assert known.all() == (degrees > 0)
+
+
+def test_misfit__does_not_depend_on_lights_that_a_take_does_not_show(new_skin):
+    """Nor on a factor of all gains, which the albedo has, too."""
+    skin = new_skin(surfels=50, lights=20, cameras=4)
+    samples = skin.lumitexels.assign(
+        surfel_normal=label("surfel_normal", skin.normal.astype(np.float32))
+    )
+    take = light_residuals(samples, rng=np.random.default_rng(0))
+    gain = np.exp(0.05 * np.random.default_rng(1).standard_normal(20))
+    alone = take.misfit(LightErrors(1.1 * gain, np.zeros((20, 3))))
+    padded = take.of_lights(np.arange(5, 25)[::-1].tolist(), 30)
+    all_gains = np.full(30, 0.7)
+    all_gains[5:25] = gain[::-1]
+    there = padded.misfit(LightErrors(all_gains, np.zeros((30, 3))))
+    assert there == pytest.approx(alone, rel=1e-9)
+    none = take.misfit(LightErrors(np.full(20, np.nan), np.full((20, 3), np.nan)))
+    assert none == take.misfit(LightErrors(np.ones(20), np.zeros((20, 3))))

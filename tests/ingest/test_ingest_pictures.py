@@ -253,6 +253,20 @@ def test_exposures_of_pictures_are_compared_and_recorded(tmp_path: Path) -> None
     rows = [f"{row},{time}" for row, time in zip(rows[1:], times, strict=True)]
     table.write_text("\n".join(["picture,x,y,z,intensity", *rows]))
     import_images(table.parent, tmp_path / "again", PERSON)
+    dome = json.loads((tmp_path / "again/dome/dome.json").read_text())
+    lit, exposure = dome["lights"][3]["intensity"][0], dome["relative_exposure"]
+    # most pictures are short here and long there: what white is in counts per intensity
+    table.write_text(
+        "\n".join(
+            ["picture,x,y,z,intensity"]
+            + [f"{row.rsplit(',', 1)[0]},0.04" for row in rows[:-1]]
+            + [rows[-1]]
+        )
+    )
+    import_images(table.parent, tmp_path / "long", PERSON)
+    dome = json.loads((tmp_path / "long/dome/dome.json").read_text())
+    scale = dome["lights"][3]["intensity"][0] / lit
+    assert dome["relative_exposure"] * scale == pytest.approx(exposure)
 
 
 def test_damaged_exif_states_nothing(tmp_path: Path) -> None:

@@ -219,7 +219,8 @@ def test_calibrate_rig__turned_lights_move_in_later_captures(tmp_path):
         workflow.fit_take(rig.db, name)
     first = degrees_off()
     assert first < 0.7 * before
-    workflow.calibrate_rig(rig.db, name="dome")
+    record = workflow.calibrate_rig(rig.db, name="dome")
+    assert workflow.describe_rig(rig.db, record)["largest_angle_error"] < 0.5 * before
     ingest(rig, "S2")
     assert degrees_off() < 1.1 * first
     assert rig.db.verify() == []
