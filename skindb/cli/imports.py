@@ -102,7 +102,7 @@ def quick(source: Path, out: Path, parameters: QuickParameters) -> None:
     error = result["normal_error"]
     lines = [
         f"{total:,} points: {parts}",
-        f"median error of the normals, as stated: {error:.1f} degrees",
+        f"stated error of the normals (with that of the model, median): {error:.1f} degrees",
         *result["files"],
     ]
     emit(result, lines)

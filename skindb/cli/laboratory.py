@@ -150,12 +150,13 @@ def _rig_lines(record: Record, report: dict[str, Any]) -> list[str]:
         f"from {len(report['takes'])} takes, {record.path}",
         f"  spread of the lights in a held-out take: {report['spread']:.1%} "
         f"without and {report['spread_left']:.1%} with the gains of the others (medians)",
-        f"  gains are known to {report['largest_relative_error']:.2%} or better",
+        f"  gains are known to {report['largest_relative_error']:.2%} or better, relative "
+        "to each other",
         "  residuals of a held-out take with the gains of the others: "
         f"{misfit['gains']:.0%} of those without; with their directions, too: "
         f"{misfit['gains and offsets']:.0%}",
         f"  directions are moved by {report['angle']:.1f} degrees (rms), known to "
-        f"{report['largest_angle_error']:.1f} or better"
+        f"{report['largest_angle_error']:.1f} or better, relative to each other"
         if report["angle"]
         else "  directions are left as stated",
     ]

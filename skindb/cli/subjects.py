@@ -291,7 +291,9 @@ def _plan_lines(plan: Withdrawal) -> list[str]:
     return [
         *(f"remove {line}" for line in plan.versions),
         *(
-            f"remove, and compute the newest again without {plan.subject}: {name}"
+            f"remove: {name}; calibrate again from other takes"
+            if name.startswith("calibration ")
+            else f"remove, and compute the newest again without {plan.subject}: {name}"
             for name in again
         ),
     ]

@@ -82,6 +82,9 @@ from skindb.parameters import IngestParameters
 from skindb.types import Float64, Half, Progress, silent
 
 # with two, one reads while the other computes
+# correlation of slopes across; faces and objects have 0.3 to 0.7, with one axis of the lights
+# mirrored -0.3 to -0.7
+MIN_INTEGRABILITY = -0.1
 MIN_THREADS = 2
 MAX_THREADS = 8
 MAX_BYTES = 4 << 30  # of memory for all threads together, unless two threads need more
@@ -232,6 +235,11 @@ class _Run:
             notes.append(
                 f"the points of the scan are {spacing:.2g} mm apart; a wider spacing leaves "
                 "the scan unchanged"
+            )
+        if self.relief is not None and self.relief.integrability < MIN_INTEGRABILITY:
+            notes.append(
+                "the lights seem to be mirrored, as no surface has these normals: check that "
+                "x of their directions is to the right, y up and z to the camera"
             )
         if self.relief is not None and spacing > 1.5 * self.parameters.spacing_mm:
             notes.append(

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
+from scipy.stats import spearmanr
 
 from skindb.calibration._merge_kernels import SATURATED
 from skindb.calibration.irradiance import light_falloff
@@ -39,6 +40,9 @@ MIN_SPREAD = 2e-3
 ROUNDS = 5  # of reweighting; the weights of a sixth differ by less than a percent
 # of the scale of residuals, from which samples count less (Holland and Welsch 1977)
 CAUCHY = 2.385
+# to the camera, and number of the points whose slopes are compared across
+MIN_COSINE_MIXED = 0.5
+MIN_MIXED = 100
 MIN_COSINE = 0.1  # to the camera; slopes beyond it are not measurable
 # of neighbouring points: depth over width, from which the surface is torn apart
 MAX_SLOPE = 8.0
@@ -55,6 +59,9 @@ class Relief:
     surface: CleanMesh
     lit: Mask  # (light, rows, columns) of the grid
     step: int  # pixels between the points of the grid
+    # correlation of the two mixed derivatives of the heights, 1 without noise; below 0 where
+    # directions of the lights are mirrored
+    integrability: float
 
     def light_fraction(self, camera: CameraRecord, position: Float64) -> Half:
         """Whether each surfel (n, light) at `position` (n, 3) is lit: 1 or 0."""
@@ -125,7 +132,13 @@ def estimate_relief(
         f"{known.sum():,} pixels without such neighbours",
         "photograph the subject larger, or with more lights",
     )
-    return Relief(Scan(vertices, faces), clean_mesh(vertices, faces), lit, step)
+    return Relief(
+        Scan(vertices, faces),
+        clean_mesh(vertices, faces),
+        lit,
+        step,
+        _integrability(normal @ camera.R.T),
+    )
 
 
 def _grey_pictures(
@@ -254,6 +267,19 @@ def _normals_of(
     facing = dots(unit, view)
     good = (spread[:, 0] > MIN_SPREAD * spread[:, 2]) & (facing > 0) & (length > 0)
     return np.where(good[:, None], unit, np.nan)
+
+
+def _integrability(normal: Float64) -> float:
+    """Rank correlation of the mixed second derivatives of the heights by normals (rows,
+    columns, 3) in the frame of the camera; NaN without neighbours.
+    """
+    facing = np.where(normal[..., 2] < -MIN_COSINE_MIXED, normal[..., 2], np.nan)
+    across, down = (-normal[..., i] / facing for i in (0, 1))
+    mixed = np.diff(across, axis=0)[:, :-1], np.diff(down, axis=1)[:-1]
+    both = np.isfinite(mixed).all(axis=0)
+    if both.sum() < MIN_MIXED:
+        return np.nan
+    return float(spearmanr(mixed[0][both], mixed[1][both]).statistic)
 
 
 def _integrated(normal: Float64, known: Mask, rays: Float64) -> Float64:

@@ -555,3 +555,18 @@ def test_several_cameras_need_a_scan(pictures: Path, tmp_path: Path) -> None:
     path.write_text(json.dumps(dome))
     with pytest.raises(InputError, match="photogrammetry"):
         read_capture(tmp_path / "capture")
+
+
+@pytest.mark.parametrize(("axis", "is_noted"), [(None, False), (0, True), (1, True)])
+def test_mirrored_lights_are_noted(
+    tmp_path: Path, axis: int | None, is_noted: bool
+) -> None:
+    names = write_pictures(tmp_path / "pictures", LIGHTS)
+    stated = LIGHTS.copy()
+    if axis is not None:
+        stated[:, axis] *= -1
+    write_table(tmp_path / "pictures/lights.csv", names, stated)
+    import_images(tmp_path / "pictures", tmp_path / "capture", PERSON)
+    tree = ingested(tmp_path / "capture", tmp_path)
+    notes = " ".join(tree.attrs["summary"]["notes"])
+    assert ("lights seem to be mirrored" in notes) == is_noted
