@@ -132,7 +132,7 @@ def calibrate(
     if report["ingest_again"]:
         earlier = ", ".join(report["ingest_again"])
         lines.append(
-            f"  captures that used an earlier calibration and should be ingested again: {earlier}"
+            f"  captures without this calibration, which should be ingested again: {earlier}"
         )
     summary = {
         "calibration": record.take,

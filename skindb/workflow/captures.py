@@ -123,6 +123,7 @@ def ingest_take(
         "choose another folder for the database",
     )
     capture = calibrated_capture(db, read_capture(folder, crop=crop))
+    capture = _with_note_of_session(db, capture)
     record = IngestParameters(**parameters)
     scratch = db.scratch() / scratch_name(capture, record)
     with logged_action(
@@ -139,6 +140,20 @@ def ingest_take(
         except (OSError, InputError):
             _require_admitted(db, capture.take, scratch)
             raise
+
+
+def _with_note_of_session(db: Database, capture: Capture) -> Capture:
+    """The capture, which says if it takes the place of one of another session."""
+    if not db.has("capture", capture.take):
+        return capture
+    earlier = db.record("capture", capture.take).provenance.get("session")
+    if earlier in (None, capture.session):
+        return capture
+    line = (
+        f"session {capture.session} takes the place of session {earlier} as the newest "
+        "capture; sessions that are compared need conditions of their own"
+    )
+    return replace(capture, skipped=(*capture.skipped, line))
 
 
 def captured_subjects(folders: Iterable[str | Path]) -> list[str]:

@@ -78,6 +78,13 @@ def quick(
         ", ".join(present),
         "name another folder, or remove them",
     )
+    require(
+        out.resolve() != Path(source).resolve(),
+        str(out),
+        "results must not be among the pictures",
+        "the folder of the pictures",
+        "name another folder",
+    )
     known = asdict(QuickParameters(**parameters))
     fit = FitParameters(eta=known.pop("eta"))
     consent = {"scope": ["fit", "export"], "reference": "quick, nothing is stored"}

@@ -121,6 +121,12 @@ def describe_rig(db: Database, record: Record) -> dict[str, Any]:
     position = rig[variables.RIG_LIGHT_POSITION].values
     turns = rig[variables.RIG_LIGHT_OFFSET].values
     turns = turns / np.linalg.norm(position, axis=1, keepdims=True)
+    uncorrected = {
+        take
+        for take in record.provenance["parameters"]["takes"]
+        if db.has("capture", take)
+        and not db.record("capture", take).provenance.get("calibrated_by")
+    }
     return {
         "lights": rig.sizes["light"],
         "takes": record.provenance["parameters"]["takes"],
@@ -137,7 +143,7 @@ def describe_rig(db: Database, record: Record) -> dict[str, Any]:
         "angle": float(np.degrees(np.sqrt(np.square(turns).sum(axis=1).mean()))),
         "largest_angle_error": float(rig[variables.RIG_LIGHT_ANGLE_ERROR].max()),
         "without_gain": [str(light) for light in few],
-        "ingest_again": takes_of_earlier(db, record),
+        "ingest_again": sorted(uncorrected.union(takes_of_earlier(db, record))),
     }
 
 

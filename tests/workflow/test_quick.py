@@ -70,6 +70,8 @@ def test_quick_writes_maps_and_a_page(pictures: Path, tmp_path: Path) -> None:
     again = run("quick", pictures, out, "--no-progress")
     assert again.returncode == 1
     assert "results are not replaced" in again.stderr
+    among = run("quick", pictures, pictures, "--no-progress")
+    assert "results must not be among the pictures" in among.stderr
 
 
 def test_three_lights_are_enough(tmp_path: Path) -> None:

@@ -115,6 +115,7 @@ def test_calibrate_rig__finds_the_planted_gains_with_their_errors(rig):
     # a session differs from the median of four others by sqrt(1 + 1.57 / 4) SESSION
     assert report["spread_left"] < 1.5 * SESSION
     assert report["without_gain"] == []
+    assert report["ingest_again"] == [f"S{number}" for number in range(5)]
     assert rig.db.verify() == []
 
 
@@ -238,6 +239,16 @@ def test_calibrate_rig__gains_that_are_not_common_are_not_stored(rig):
     with pytest.raises(InputError, match=message):
         workflow.calibrate_rig(rig.db, ["U0", "U1", "U2"], name="dome")
     assert not rig.db.has("calibration", "dome")
+
+
+def test_ingest__another_session_of_a_take_is_noted(rig):
+    same = ingest(rig, "S0")
+    assert "takes the place" not in str(same.provenance["skipped"])
+    file = rig.folder / "S0/capture.json"
+    record = json.loads(file.read_text()) | {"session": "2026-01-02T10:00:00+01:00"}
+    file.write_text(json.dumps(record))
+    line = f"takes the place of session {same.provenance['session']} as the newest"
+    assert line in str(ingest(rig, "S0").provenance["skipped"])
 
 
 def test_calibrate_rig__mistakes(rig, tmp_path):
