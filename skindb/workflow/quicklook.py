@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 import tempfile
 from dataclasses import asdict
 from pathlib import Path
@@ -21,11 +23,14 @@ from skindb.parameters import FitParameters, QuickParameters
 from skindb.render.image import write_exr, write_png
 from skindb.schema import FitStatus
 from skindb.store.database import Database
+from skindb.store.lease import has_ended, this_process
 from skindb.types import Array, Float64, Progress, silent
 from skindb.workflow.captures import ingest_take
 from skindb.workflow.fit import fit_take
 from skindb.workflow.pictures import view_takes
 
+PREFIX = "skindb-quick-"  # of temporary folders
+PROCESS = "process.json"
 # of the grid; more make a page that browsers turn slowly
 MAX_POINTS = 60_000
 # sRGB of the brightest hundredth of the albedo, which is relative
@@ -88,7 +93,10 @@ def quick(
     known = asdict(QuickParameters(**parameters))
     fit = FitParameters(eta=known.pop("eta"))
     consent = {"scope": ["fit", "export"], "reference": "quick, nothing is stored"}
-    with private_umask(), tempfile.TemporaryDirectory(prefix="skindb-") as folder:
+    _remove_left()
+    with private_umask(), tempfile.TemporaryDirectory(prefix=PREFIX) as folder:
+        # which a killed run leaves
+        (Path(folder) / PROCESS).write_text(json.dumps(this_process()))
         capture = Path(folder) / "capture"
         imported = import_images(
             source,
@@ -110,6 +118,14 @@ def quick(
         result = _write_maps(model, out, step)
     notes = [*imported.notes, RELATIVE]
     return {"files": [str(out / name) for name in names], "notes": notes} | result
+
+
+def _remove_left() -> None:
+    """Remove the folders of killed runs, with their copies of photographs."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{PREFIX}*"):
+        holder = read_json(folder / PROCESS, [])
+        if isinstance(holder, dict) and has_ended(holder):
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _write_maps(model: xr.DataTree, out: Path, step: int) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import io
 import json
 import subprocess
 import sys
+import tempfile
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from unittest import mock
@@ -20,6 +21,7 @@ from skindb.cli import main
 from skindb.errors import InputError
 from skindb.ingest import import_images
 from skindb.render.image import read_exr, read_png
+from skindb.store.lease import this_process
 from skindb.workflow.studies import _require_one_scale
 
 LIGHTS = directions(13)
@@ -165,3 +167,27 @@ def test_takes_of_different_exposures_are_not_mixed(
     _require_one_scale(db, study, [records["short"], records["same"]])
     with pytest.raises(InputError, match=r"one exposure; found 0\.01 and 0\.02"):
         _require_one_scale(db, study, [*records.values()])
+
+
+def test_quick_removes_what_a_killed_run_left(
+    pictures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    program = (
+        "import json; from skindb.store.lease import this_process\n"
+        "print(json.dumps(this_process()))"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    for name, holder in (
+        ("skindb-quick-ended", ended.stdout),
+        ("skindb-quick-running", json.dumps(this_process())),
+        ("skindb-quick-unknown", "{"),
+    ):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "process.json").write_text(holder)
+    result = run("quick", pictures, tmp_path / "out", "--no-progress")
+    assert result.returncode == 0, result.stderr
+    left = sorted(path.name for path in tmp_path.glob("skindb-*"))
+    assert left == ["skindb-quick-running", "skindb-quick-unknown"]
