@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 
 from skindb.errors import require
-from skindb.files import make_private, private_umask
+from skindb.files import make_private, private_file, private_umask
 from skindb.fit.plan import RELATIVE
 from skindb.format.fields import read_json
 from skindb.geometry.camera import project
@@ -96,7 +96,7 @@ def quick(
     _remove_left()
     with private_umask(), tempfile.TemporaryDirectory(prefix=PREFIX) as folder:
         # which a killed run leaves
-        (Path(folder) / PROCESS).write_text(json.dumps(this_process()))
+        private_file(Path(folder) / PROCESS).write_text(json.dumps(this_process()))
         capture = Path(folder) / "capture"
         imported = import_images(
             source,
