@@ -515,8 +515,8 @@ def rig_positions(rig: xr.Dataset) -> dict[str, Float64]:
 
 
 def rig_dome(dome: DomeRecord, calibration: xr.Dataset, *, where: str) -> DomeRecord:
-    """The dome with the gains and offsets of the lights by a calibration from takes; lights
-    that it does not have keep their own.
+    """The dome with the gains and offsets of the lights, and gains of the cameras, by a
+    calibration from takes; lights and cameras that it does not have keep their own.
 
     Raises
     ------
@@ -547,7 +547,13 @@ def rig_dome(dome: DomeRecord, calibration: xr.Dataset, *, where: str) -> DomeRe
         )
         for light, gain, offset in zip(dome.lights, gains, offsets, strict=True)
     )
-    return replace(dome, lights=tuple(lights))
+    names = [camera.id for camera in dome.cameras]
+    sensitivity = calibration["rig_camera_gain"].reindex(camera=names, fill_value=1.0)
+    cameras = (
+        replace(camera, gain=tuple(gain.tolist()))
+        for camera, gain in zip(dome.cameras, sensitivity.values, strict=True)
+    )
+    return replace(dome, lights=tuple(lights), cameras=tuple(cameras))
 
 
 def calibrate_positions(dome: DomeRecord, ball: BallFrames) -> xr.Dataset:

@@ -66,6 +66,8 @@ class FrameMerger:
             spans = np.tile(np.array([0, width]), (height, 1))
         if self.camera.sensor.kind.bits == 0:
             develop_linear(sample_bits(_only(frames)), spans, radiance, flag)
+            if set(self.camera.gain) != {1.0}:
+                radiance /= np.array(self.camera.gain, np.float32)
             if usable is not None:
                 usable[:] = 2
             return radiance, flag
@@ -76,7 +78,7 @@ class FrameMerger:
     @cached_property
     def _exposure_model(self) -> ExposureModel:
         sensor = self.camera.sensor
-        matrix = self.camera.colour_matrix
+        matrix = self.camera.colour_matrix / np.array(self.camera.gain)[:, None]
         dark = np.zeros((0, 1, 1, 3), sensor.kind.dtype)
         if self.dark is not None:
             dark = np.ascontiguousarray(self.dark)

@@ -82,7 +82,7 @@ def _ask(site: str, number: int) -> None:
 @click.option(
     "--from-takes",
     is_flag=True,
-    help="Errors of the lights from fitted takes of a rig.  [default: all takes]",
+    help="Errors of lights and cameras from fitted takes of a rig.  [default: all takes]",
 )
 @options_of(CalibrationParameters)
 @common
@@ -160,6 +160,13 @@ def _rig_lines(record: Record, report: dict[str, Any]) -> list[str]:
         if report["angle"]
         else "  directions are left as stated",
     ]
+    if report["camera_gains"]:
+        lines.append(
+            f"  spread of the cameras in a held-out take: {report['camera_spread']:.1%} "
+            f"without and {report['camera_spread_left']:.1%} with the gains of the others"
+        )
+    elif report["cameras"] > 1:
+        lines.append("  cameras are left as stated")
     if few := report["without_gain"]:
         lines.append(f"  gain 1, as fewer than three takes show them: {', '.join(few)}")
     return lines

@@ -3,7 +3,11 @@ translucency.
 """
 
 from skindb.fit.albedo import estimate_diffuse_reflectance
-from skindb.fit.corrections import estimate_light_gains, light_residuals
+from skindb.fit.corrections import (
+    estimate_camera_gains,
+    estimate_light_gains,
+    light_residuals,
+)
 from skindb.fit.gloss import estimate_gloss
 from skindb.fit.joint import refine_jointly
 from skindb.fit.kernels import compile_kernels
@@ -37,6 +41,7 @@ __all__ = [
     "describe_prediction",
     "dictionary_report",
     "embedded_dictionary",
+    "estimate_camera_gains",
     "estimate_diffuse_reflectance",
     "estimate_gloss",
     "estimate_light_gains",

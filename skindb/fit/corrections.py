@@ -4,7 +4,7 @@ parts of the face reflect with one diffuse bounce.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -42,6 +42,7 @@ PRIOR = 0.03
 # faces under strobes within 0.05 points; 0.03 is worse by 0.2, and 2 by 0.15
 PRIOR_TURN = 0.3
 TURN = 1e-3  # rad, for derivatives
+ROUNDS = 10  # in which rows that lack different gains are made relative to each other
 SURFELS_PER_BLOCK = 2048  # whose bounced light is gathered at once
 NEEDED = ("surfel_position", "surfel_normal", "light_position", "camera_position")
 
@@ -194,6 +195,67 @@ def light_residuals(
     return LightResiduals(form, axes, applied or none)
 
 
+def estimate_camera_gains(
+    lumitexels: xr.Dataset, *, rng: np.random.Generator, eta: float = 1.3
+) -> xr.DataArray:
+    """Ratio of the true to the calibrated sensitivity of each camera, by comparison of the
+    diffuse light that several cameras see from the same surfels.
+
+    Parameters
+    ----------
+    lumitexels, rng, eta
+        See `estimate_light_gains`.
+
+    Returns
+    -------
+    DataArray
+        (camera, channel), whose median over the cameras is 1 in every channel; NaN for
+        cameras that share no usable surfel with others.
+    """
+    few, lights = _chosen(lumitexels, rng)
+    samples = few["reflectance_sample"].values.astype(np.float64)
+    shape = (samples.shape[0], *samples.shape[2:])
+    logs = np.full(shape, np.nan)
+    for view in _views(few, [lights], eta=eta):
+        seen = samples[view.surfel, view.lights, view.camera]
+        columns = view.shading[0][view.lights]
+        if _smooth(columns, seen.mean(axis=1)) is None:
+            continue
+        level = np.linalg.lstsq(columns, seen, rcond=None)[0][2]
+        leaves = fresnel_transmittance(view.cosine, eta)
+        if (level > 0).all():
+            logs[view.surfel, view.camera] = np.log(level / leaves)
+    logs[np.isfinite(logs).all(axis=2).sum(axis=1) < 2] = np.nan
+    gains = np.full(shape[1:], np.nan)
+    shared = np.isfinite(logs).any(axis=(0, 2))
+    if shared.any():
+        gains[shared] = np.stack(
+            [
+                np.nanmedian(aligned(x), axis=0)
+                for x in np.moveaxis(logs[:, shared], 2, 0)
+            ],
+            axis=1,
+        )
+        gains = np.exp(gains - np.median(gains[shared], axis=0))
+    names = {"camera": np.arange(shape[1]), "channel": np.arange(shape[2])}
+    coords = {name: lumitexels.coords.get(name, names[name]) for name in names}
+    return xr.DataArray(gains, coords, [*names])
+
+
+def aligned(logs: Array) -> Array:
+    """Logarithms (n, m) of gains, relative to those that all rows have in common, as each
+    row may lack others.
+    """
+    known = np.isfinite(logs).any(axis=1)
+    even = logs.copy()
+    even[known] -= np.nanmedian(logs[known], axis=1, keepdims=True)
+    for _ in range(ROUNDS):
+        middle = np.nanmedian(even, axis=0)
+        middle -= np.median(middle)
+        even[known] -= np.nanmedian(even[known] - middle, axis=1, keepdims=True)
+    return even
+
+
 def divided_by_gains(lumitexels: xr.Dataset, light_gain: xr.DataArray) -> xr.Dataset:
     """The samples divided by the gains of their lights."""
     sample = lumitexels["reflectance_sample"]
@@ -240,18 +302,46 @@ def _residual_form(
     ndarray
         (p light, p light) for p sets of positions.
     """
+    few, _ = _chosen(lumitexels, rng)
+    samples = few["reflectance_sample"].values.astype(np.float64).mean(axis=3)
+    matrix = np.zeros((len(lights) * samples.shape[1],) * 2)
+    for view in _views(few, lights, eta=eta):
+        _add_view(
+            samples[view.surfel, :, view.camera], view.shading, view.lights, matrix
+        )
+    return matrix
+
+
+def _chosen(
+    lumitexels: xr.Dataset, rng: np.random.Generator
+) -> tuple[xr.Dataset, Array]:
+    """Samples and geometry of the surfels that are used, and positions of the lights."""
     names = ("reflectance_sample", *NEEDED)
     check(lumitexels, names, where="lumitexels")
     surfels = lumitexels.sizes["surfel"]
-    cameras = lumitexels.sizes["camera"]
-    chosen = np.sort(
-        rng.choice(surfels, min(-(-VIEWS // cameras), surfels), replace=False)
-    )
+    count = min(-(-VIEWS // lumitexels.sizes["camera"]), surfels)
+    chosen = np.sort(rng.choice(surfels, count, replace=False))
     few = lumitexels[list(names)].isel(surfel=chosen).compute()
-    samples = few["reflectance_sample"].values.astype(np.float64).mean(axis=3)
-    matrix = np.zeros((len(lights) * samples.shape[1],) * 2)
-    position, normal, _, camera = (
-        few[name].values.astype(np.float64) for name in names[1:]
+    return few, few["light_position"].values.astype(np.float64)
+
+
+class _View(NamedTuple):
+    """A surfel in a camera, and the lights whose samples are finite, neither grazing nor
+    near a highlight.
+    """
+
+    surfel: int
+    camera: int
+    cosine: float  # to the camera
+    shading: Sequence[Array]  # (light, SMOOTH) for each set of positions of the lights
+    lights: NDArray[np.intp]
+
+
+def _views(few: xr.Dataset, lights: Sequence[Array], *, eta: float) -> Iterator[_View]:
+    """Views of enough lights."""
+    finite = np.isfinite(few["reflectance_sample"].values).all(axis=3)
+    position, normal, camera = (
+        few[name].values.astype(np.float64) for name in (*NEEDED[:2], NEEDED[3])
     )
     to_light = directions(position, lights[0])
     to_camera = directions(position, camera)
@@ -275,13 +365,21 @@ def _residual_form(
             usable = (lit[i] > MIN_COSINE_GAIN) & (
                 half < np.cos(np.radians(MIN_HALF_ANGLE))
             )
-            _add_view(
-                samples[i, :, c],
-                shading,
-                np.flatnonzero(usable & np.isfinite(samples[i, :, c])),
-                matrix,
-            )
-    return matrix
+            at = np.flatnonzero(usable & finite[i, :, c])
+            if len(at) >= SMOOTH + SPARE:
+                yield _View(i, int(c), seen[i, c], shading, at)
+
+
+def _smooth(columns: Array, seen: Array) -> Array | None:
+    """Coefficients (SMOOTH,) of the smooth function that is nearest to samples (light,);
+    None if a sample is far from it, or the function near 0.
+    """
+    smooth = np.linalg.lstsq(columns, seen, rcond=None)[0]
+    fitted = columns @ smooth
+    if fitted.min() <= SMALLEST_SHADING * max(np.median(fitted), 0.0):
+        return None
+    ratio = seen / fitted
+    return None if ratio.min() < LOWEST or ratio.max() > HIGHEST else smooth
 
 
 def _add_view(
@@ -290,19 +388,16 @@ def _add_view(
     """Add to `matrix` the squared residuals of a smooth function for the samples of
     lights `at`; `shading` (light, SMOOTH) for each set of positions.
     """
-    if len(at) < SMOOTH + SPARE:
-        return
     columns = shading[0][at]
-    seen = sample[at]
-    smooth = np.linalg.lstsq(columns, seen, rcond=None)[0]
+    smooth = _smooth(columns, sample[at])
+    if smooth is None:
+        return
     fitted = columns @ smooth
-    if fitted.min() <= SMALLEST_SHADING * max(np.median(fitted), 0.0):
-        return
-    ratio = seen / fitted
-    if ratio.min() < LOWEST or ratio.max() > HIGHEST:
-        return
     q, _ = np.linalg.qr(columns / fitted[:, None])
-    changes = [ratio, *((fitted - s[at] @ smooth) / fitted / TURN for s in shading[1:])]
+    changes = [
+        sample[at] / fitted,
+        *((fitted - s[at] @ smooth) / fitted / TURN for s in shading[1:]),
+    ]
     slope = np.concatenate(
         [np.diag(change) - q @ (q.T * change) for change in changes], axis=1
     )

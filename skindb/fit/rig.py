@@ -7,26 +7,35 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from skindb.fit.corrections import LightErrors, LightResiduals, light_residuals
+from skindb.fit.corrections import (
+    LightErrors,
+    LightResiduals,
+    aligned,
+    estimate_camera_gains,
+    light_residuals,
+)
 from skindb.fit.lumitexels import lumitexels
 from skindb.numerics.statistics import NORMAL_PER_MEDIAN
 from skindb.schema import dataset, label, variables
 from skindb.types import Array
 
 MIN_TAKES = 3  # of a light; the median of two is a mean, which one wrong gain spoils
-ROUNDS = 3  # in which takes that show different lights are made relative to each other
 # variance of a median over that of a mean, of many normal values
 MEDIAN_VARIANCE = np.pi / 2
 # of the residuals of a held-out take with gains alone: offsets that leave more are not
 # used. 0.95 to 0.96 for three to eight faces under strobes; virtual skin: 0.75 to 0.93 under
 # lights that are 1 degree off, 0.98 to 1.01 under lights that are where they are stated
 MAX_LEFT_BY_OFFSETS = 0.97
+# of gains of the cameras that are used: 0.006 are found for perfect cameras
+MIN_CAMERA_SPREAD = 0.012
 
 
-def take_light_residuals(
+def take_residuals(
     capture: xr.DataTree, model: xr.DataTree, *, rng: np.random.Generator
-) -> LightResiduals:
-    """What a fitted take says about its lights, see `skindb.fit.light_residuals`."""
+) -> tuple[LightResiduals, xr.DataArray]:
+    """What a fitted take says about its lights and about its cameras, see
+    `skindb.fit.light_residuals` and `skindb.fit.estimate_camera_gains`.
+    """
     fitted = model["fitted"].to_dataset()
     dome = capture["dome"].to_dataset()
     normal = fitted[variables.SHADING_NORMAL].values
@@ -38,7 +47,10 @@ def take_light_residuals(
         names = (variables.LIGHT_GAIN_APPLIED, variables.LIGHT_OFFSET_APPLIED)
         applied = LightErrors(*(dome[name].values for name in names))
     eta = float(fitted[variables.REFRACTIVE_INDEX])
-    return light_residuals(samples, rng=rng, eta=eta, applied=applied)
+    cameras = estimate_camera_gains(samples, rng=rng, eta=eta)
+    if variables.CAMERA_GAIN_APPLIED in dome:
+        cameras = cameras * dome[variables.CAMERA_GAIN_APPLIED]
+    return light_residuals(samples, rng=rng, eta=eta, applied=applied), cameras
 
 
 def common_light_errors(
@@ -50,7 +62,7 @@ def common_light_errors(
     Parameters
     ----------
     takes
-        From `take_light_residuals`, of the same lights.
+        From `take_residuals`, of the same lights.
     lights
         Ids of the lights.
     positions
@@ -102,6 +114,51 @@ def common_light_errors(
     )
 
 
+def common_camera_gains(takes: Sequence[xr.DataArray]) -> xr.Dataset:
+    """Gains of the cameras that the takes of a rig have in common.
+
+    Parameters
+    ----------
+    takes
+        Gains (camera, channel) of each take, from `take_residuals`.
+
+    Returns
+    -------
+    Dataset
+        Part of the group "rig_calibration". The gains are 1 unless they are larger than
+        the errors of the estimate, and those of the others lower the spread in a
+        held-out take.
+    """
+    gains = xr.concat(takes, "take", join="outer").transpose("take", "camera", ...)
+    unmoved = np.zeros((gains.sizes["camera"], 3))
+    channels = [
+        Common([LightErrors(take, unmoved) for take in channel])
+        for channel in np.moveaxis(gains.values, 2, 0)
+    ]
+    logs, others = (
+        np.concatenate([getattr(common, name) for common in channels], axis=1)
+        for name in ("logs", "others_logs")
+    )
+    spread, left = _median_spread(logs), _median_spread(logs - others)
+    gain, log_error = (
+        np.stack(columns, axis=1)
+        for columns in zip(
+            *((c.errors.gain, c.log_error) for c in channels), strict=True
+        )
+    )
+    if not left < MAX_LEFT_BY_OFFSETS * spread or spread < MIN_CAMERA_SPREAD:
+        gain, log_error = np.ones(gain.shape), np.full(gain.shape, np.nan)
+    return dataset(
+        {
+            variables.RIG_CAMERA_GAIN: gain,
+            variables.RIG_CAMERA_GAIN_ERROR: gain * log_error,
+            variables.RIG_CAMERA_SPREAD: spread,
+            variables.RIG_CAMERA_SPREAD_LEFT: left,
+        },
+        coords={name: gains[name].values for name in ("camera", "channel")},
+    )
+
+
 class Common:
     """Median of the errors of the lights over takes, that over the others of each take,
     and their standard errors. Lights of fewer than three takes keep gain 1 and offset 0.
@@ -120,7 +177,7 @@ class Common:
         offset = np.zeros(offsets.shape[1:])
         others_offset = np.full(offsets.shape, np.nan)
         if shared.any():
-            self.logs[:, shared] = _aligned(np.log(gains[:, shared]))
+            self.logs[:, shared] = aligned(np.log(gains[:, shared]))
             log[shared], self.others_logs[:, shared], self.log_error[shared] = _medians(
                 self.logs[:, shared]
             )
@@ -149,20 +206,6 @@ def _medians(values: Array) -> tuple[Array, Array, Array]:
     deviation = np.maximum(deviation, np.median(deviation, axis=0))
     error = deviation * np.sqrt(MEDIAN_VARIANCE / takes)
     return np.nanmedian(values, axis=0), others, error
-
-
-def _aligned(logs: Array) -> Array:
-    """Logarithms (take, light) of gains, relative to those that all takes have in
-    common: each take may show other lights.
-    """
-    known = np.isfinite(logs).any(axis=1)
-    aligned = logs.copy()
-    aligned[known] -= np.nanmedian(logs[known], axis=1, keepdims=True)
-    for _ in range(ROUNDS):
-        middle = np.nanmedian(aligned, axis=0)
-        middle -= np.median(middle)
-        aligned[known] -= np.nanmedian(aligned[known] - middle, axis=1, keepdims=True)
-    return aligned
 
 
 def _median_spread(logs: Array) -> float:

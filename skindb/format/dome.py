@@ -102,6 +102,8 @@ class CameraRecord(Pinhole):
     vignette: Float64  # a2 a4 a6
     # degree of circular polarisation of the light that it sees: 1 right, -1 left, 0 any
     polarisation: float = 0.0
+    # by a calibration from takes; the radiance of the channels is divided by it
+    gain: tuple[float, ...] = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)

@@ -112,6 +112,8 @@ def dome_group(dome: DomeRecord, intensity: Float64) -> xr.Dataset:
     if any(light.gain != 1 or any(light.offset) for light in lights):
         variables["light_gain_applied"] = [light.gain for light in lights]
         variables["light_offset_applied"] = [light.offset for light in lights]
+    if any(set(camera.gain) != {1.0} for camera in cameras):
+        variables["camera_gain_applied"] = [camera.gain for camera in cameras]
     by_light = [light.polarisation for light in lights]
     by_camera = [camera.polarisation for camera in cameras]
     if any(by_light) and any(by_camera):

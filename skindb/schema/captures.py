@@ -170,6 +170,10 @@ LIGHT_OFFSET_APPLIED = declare(
     "float64 dome/light_offset_applied(light, xyz) [mm]",
     "offset by a calibration from takes, which was added to the position; 0 if absent",
 )
+CAMERA_GAIN_APPLIED = declare(
+    "float64 dome/camera_gain_applied(camera, channel) [1]",
+    "gain by a calibration from takes, by which the radiance was divided; 1 if absent",
+)
 LIGHT_POLARISATION = declare(
     "float32 dome/light_polarisation(light) [1]",
     "degree of circular polarisation, 1 right-handed, -1 left-handed, 0 without "
@@ -298,6 +302,25 @@ RIG_SPREAD = declare(
 )
 RIG_SPREAD_LEFT = declare(
     "float64 rig_calibration/rig_spread_left() [1]",
+    "the same after division by the common gains of the other takes",
+)
+RIG_CAMERA_GAIN = declare(
+    "float64 rig_calibration/rig_camera_gain(camera, channel) [1]",
+    "true over stated sensitivity relative to the median camera, median over the takes; 1 "
+    "for cameras of fewer than three takes, or if those of other takes do not predict a "
+    "take",
+)
+RIG_CAMERA_GAIN_ERROR = declare(
+    "float64 rig_calibration/rig_camera_gain_error(camera, channel) [1]",
+    "its standard error by the scatter of the takes; NaN where the gain was not estimated",
+)
+RIG_CAMERA_SPREAD = declare(
+    "float64 rig_calibration/rig_camera_spread() [1]",
+    "standard deviation over cameras and channels of the logarithms of the gains of a "
+    "take; median of the takes, NaN for one camera",
+)
+RIG_CAMERA_SPREAD_LEFT = declare(
+    "float64 rig_calibration/rig_camera_spread_left() [1]",
     "the same after division by the common gains of the other takes",
 )
 RIG_MISFIT = declare(

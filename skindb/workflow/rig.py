@@ -11,7 +11,12 @@ import xarray as xr
 from skindb.calibration.lights import is_same_rig, moved_lights
 from skindb.errors import input_error, require
 from skindb.fit.corrections import LightResiduals
-from skindb.fit.rig import MIN_TAKES, common_light_errors, take_light_residuals
+from skindb.fit.rig import (
+    MIN_TAKES,
+    common_camera_gains,
+    common_light_errors,
+    take_residuals,
+)
 from skindb.format.fields import NAME
 from skindb.schema import variables
 from skindb.store import CALIBRATION, Database, Record, require_text
@@ -29,8 +34,9 @@ def calibrate_rig(
     seed: int = 0,
     progress: Progress = silent,
 ) -> Record:
-    """Estimate the errors of intensity and direction of the lights that all takes of a rig
-    have in common, and commit them as the next version of the calibration of that name.
+    """Estimate the errors of intensity and direction of the lights, and of the sensitivity
+    of the cameras, that all takes of a rig have in common, and commit them as the next
+    version of the calibration of that name.
 
     A take that is ingested later without the name of a calibration, with the same lights,
     uses them. What the takes themselves were ingested with is taken into account.
@@ -73,6 +79,7 @@ def calibrate_rig(
     )
     inputs = list[Record]()
     residuals = list[tuple[LightResiduals, dict[str, Float64]]]()
+    cameras = list[xr.DataArray]()
     positions = dict[str, Float64]()
     for number, (take, model) in enumerate(models.items()):
         progress("lights", number, len(models))
@@ -84,8 +91,9 @@ def calibrate_rig(
         positions = lights | positions
         rng = np.random.default_rng([seed, number])
         fitted = db.read("model", take, generation=model.generation)
-        own = take_light_residuals(capture, fitted, rng=rng)
+        own, camera_gains = take_residuals(capture, fitted, rng=rng)
         residuals.append((own, lights))
+        cameras.append(camera_gains)
         inputs += [record, model]
     names = [*positions]
     group = common_light_errors(
@@ -96,6 +104,7 @@ def calibrate_rig(
         lights=names,
         positions=np.array([*positions.values()]),
     )
+    group = group.merge(common_camera_gains(cameras))
     _require_help(group)
     progress("lights", len(models), len(models))
     provenance = {
@@ -111,8 +120,8 @@ def calibrate_rig(
 
 
 def describe_rig(db: Database, record: Record) -> dict[str, Any]:
-    """Gains and directions of a calibration from takes: their spread, errors, and the
-    spread that they leave in a held-out take.
+    """Gains and directions of the lights and gains of the cameras of a calibration from
+    takes: their spread, errors, and the spread that they leave in a held-out take.
     """
     stored = db.read(CALIBRATION, record.take, generation=record.generation)
     rig = stored[RIG].to_dataset().load()
@@ -133,6 +142,10 @@ def describe_rig(db: Database, record: Record) -> dict[str, Any]:
         "largest_relative_error": float(rig[variables.RIG_LIGHT_GAIN_ERROR].max()),
         "spread": float(rig[variables.RIG_SPREAD]),
         "spread_left": float(rig[variables.RIG_SPREAD_LEFT]),
+        "cameras": rig.sizes["camera"],
+        "camera_spread": float(rig[variables.RIG_CAMERA_SPREAD]),
+        "camera_spread_left": float(rig[variables.RIG_CAMERA_SPREAD_LEFT]),
+        "camera_gains": bool((rig[variables.RIG_CAMERA_GAIN] != 1).any()),
         "misfit": dict(
             zip(
                 rig["correction"].values.tolist(),

@@ -7,9 +7,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skindb.fit import light_residuals
+from skindb.fit import estimate_camera_gains, light_residuals
 from skindb.fit.corrections import LightErrors
-from skindb.fit.rig import Common, common_light_errors
+from skindb.fit.rig import Common, common_camera_gains, common_light_errors
 from skindb.schema import label
 
 DISTANCE_MM = 880.0  # of the lights of virtual skin
@@ -120,3 +120,47 @@ def test_misfit__does_not_depend_on_lights_that_a_take_does_not_show(new_skin):
     assert there == pytest.approx(alone, rel=1e-9)
     none = take.misfit(LightErrors(np.full(20, np.nan), np.full((20, 3), np.nan)))
     assert none == take.misfit(LightErrors(np.ones(20), np.zeros((20, 3))))
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.1])
+def test_common_camera_gains__are_found_and_those_of_perfect_cameras_are_1(
+    new_skin, spread
+):
+    """Three takes; what several cameras see of glossy skin away from its highlights
+    differs by 0.3 %.
+    """
+    planted = np.exp(spread * np.random.default_rng(2).standard_normal((6, 3)))
+    planted /= np.median(planted, axis=0)
+    takes = []
+    for seed in range(3):
+        skin = new_skin(surfels=200, lights=40, cameras=6, noise=0.01, seed=seed)
+        sample = skin.lumitexels["reflectance_sample"].values.astype(np.float32)
+        samples = skin.lumitexels.assign(
+            surfel_normal=label("surfel_normal", skin.normal.astype(np.float32)),
+            reflectance_sample=label(
+                "reflectance_sample", (sample * planted).astype(np.float16)
+            ),
+        )
+        takes.append(estimate_camera_gains(samples, rng=np.random.default_rng(0)))
+    group = common_camera_gains(takes)
+    gain = group["rig_camera_gain"].values
+    np.testing.assert_allclose(gain, planted, rtol=0.012 if spread else 0)
+    known = np.isfinite(group["rig_camera_gain_error"].values)
+    assert known.all() == (spread > 0)
+    # cameras that fewer than three takes have, and gains that are not common
+    few = common_camera_gains([takes[0].isel(camera=slice(4)), *takes[1:]])
+    np.testing.assert_array_equal(few["rig_camera_gain"].values[4:], 1)
+    apart = common_camera_gains([take.roll(camera=k) for k, take in enumerate(takes)])
+    np.testing.assert_array_equal(apart["rig_camera_gain"].values, 1)
+
+
+def test_estimate_camera_gains__one_camera_has_none(new_skin):
+    skin = new_skin(surfels=50, lights=20, cameras=1)
+    samples = skin.lumitexels.assign(
+        surfel_normal=label("surfel_normal", skin.normal.astype(np.float32))
+    )
+    gains = estimate_camera_gains(samples, rng=np.random.default_rng(0))
+    assert np.isnan(gains).all()
+    group = common_camera_gains([gains] * 3)
+    assert (group["rig_camera_gain"] == 1).all()
+    assert np.isnan(group["rig_camera_spread"])

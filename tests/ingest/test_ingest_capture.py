@@ -52,6 +52,7 @@ ABSENT = (
     "relative_reflectance",
     "light_gain_applied",
     "light_offset_applied",
+    "camera_gain_applied",
 )
 
 
