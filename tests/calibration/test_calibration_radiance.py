@@ -151,6 +151,20 @@ def test_frame_merger__applies_vignette_and_colour_matrix(pristine):
     np.testing.assert_allclose(made, expected, rtol=1e-5)
 
 
+@pytest.mark.parametrize("kind", [FrameKind(6, 1, 16), FrameKind(6, 1, 0)])
+def test_frame_merger__divides_the_channels_by_the_gains_of_the_camera(kind):
+    sensor = replace(SENSOR, kind=kind)
+    gain = (0.5, 1.0, 2.0)
+    frame = np.full((2, 3, 3), 1000, np.uint16 if kind.bits else np.float32)
+    plain, made = (
+        FrameMerger(
+            SimpleNamespace(sensor=sensor, colour_matrix=np.eye(3), gain=gain), (1.0,)
+        ).merge([frame])[0]
+        for gain in ((1.0, 1.0, 1.0), gain)
+    )
+    np.testing.assert_allclose(made, plain / np.float32(gain), rtol=1e-6)
+
+
 def test_vignette_gain__corner_and_centre(pristine):
     camera = replace(
         read_capture(pristine).dome.cameras[0], vignette=np.array([-0.4, 0.1, -0.05])
@@ -380,7 +394,9 @@ def test_frame_merger__counts_exposures_that_are_neither_dark_nor_saturated():
         np.rint(BLACK + np.minimum(truth * t, 1) * (WHITE - BLACK)).astype(np.uint16)
         for t in BRACKETS
     ]
-    camera = SimpleNamespace(sensor=quiet, colour_matrix=np.eye(3))
+    camera = SimpleNamespace(
+        sensor=quiet, colour_matrix=np.eye(3), gain=(1.0, 1.0, 1.0)
+    )
     usable = np.zeros((1, 6), np.uint8)
     FrameMerger(camera, BRACKETS).merge(frames, usable=usable)
     assert usable.tolist() == [[0, 4, 3, 2, 1, 0]]
