@@ -5,7 +5,7 @@ together, one line each.
 from __future__ import annotations
 
 import errno
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeVar
@@ -53,6 +53,12 @@ def printable(text: str, length: int = MAX_PART_CHARACTERS) -> str:
         head = length * 2 // 3
         text = f"{text[:head]}...{text[len(text) - (length - head - 3) :]}"
     return " ".join(escaped(text.replace("\n", " ").replace("\t", " ")).split())
+
+
+def few_names(names: Sequence[str], count: int = 3, separator: str = ", ") -> str:
+    """Names for a message: the first ones, and how many more there are."""
+    rest = len(names) - count
+    return separator.join(names[:count]) + (f" and {rest} more" if rest > 0 else "")
 
 
 def escaped(text: str) -> str:

@@ -24,7 +24,7 @@ from skindb.analysis.subjects import (
     multiple_correlation,
     subjects_of,
 )
-from skindb.errors import require
+from skindb.errors import few_names, require
 from skindb.schema import IDENTIFIED, dataset, variables
 from skindb.schema.cohort import require_takes
 from skindb.types import Array
@@ -285,15 +285,15 @@ def _crossing_flags(
         # crossings of a value without subjects are not listed again
         empty = [cell for cell in empty if all(counts[part,] for part in cell)]
     if empty:
-        listed = _join_names([_cell_values(cell) for cell in empty])
+        listed = few_names([_cell_values(cell) for cell in empty], MAX_LISTED)
         flags.append(f"{name}: no subjects in {listed}")
     if factors > 1 and small and len(small) == sum(counts[cell] > 0 for cell in cells):
         flags.append(
             f"{name}: all {len(small)} cells with subjects have fewer than {FEW}"
         )
     elif small:
-        listed = _join_names(
-            [f"{_cell_values(cell)} ({counts[cell]})" for cell in small]
+        listed = few_names(
+            [f"{_cell_values(cell)} ({counts[cell]})" for cell in small], MAX_LISTED
         )
         flags.append(f"{name}: fewer than {FEW} subjects: {listed}")
     return flags
@@ -354,11 +354,6 @@ def _band(age: object) -> str:
 
 def _cell_values(cell: tuple[str, ...]) -> str:
     return AND.join(part.partition(": ")[2] for part in cell)
-
-
-def _join_names(names: Sequence[str]) -> str:
-    rest = len(names) - MAX_LISTED
-    return ", ".join(names[:MAX_LISTED]) + (f" and {rest} more" if rest > 0 else "")
 
 
 def describe_coverage(report: xr.Dataset) -> list[str]:

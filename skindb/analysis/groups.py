@@ -32,7 +32,7 @@ from skindb.analysis.study import (
     table_of,
 )
 from skindb.analysis.subjects import notes_on_attributes, subjects_of
-from skindb.errors import InputError
+from skindb.errors import InputError, few_names
 from skindb.numerics.inference import (
     Effects,
 )
@@ -330,9 +330,7 @@ def _detectable_line(name: str, part: xr.Dataset) -> list[str]:
     ]
     if not detectable:
         return []
-    listed = ", ".join(detectable[:MAX_LISTED])
-    if len(detectable) > MAX_LISTED:
-        listed += f" and {len(detectable) - MAX_LISTED} more"
+    listed = few_names(detectable, MAX_LISTED)
     return [f"{name}: detectable differences (power 80 %): {listed}"]
 
 

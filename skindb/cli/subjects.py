@@ -19,7 +19,7 @@ from skindb.cli.shared import (
     shared_path,
 )
 from skindb.cli.terminal import bar, confirm, echo
-from skindb.errors import input_error
+from skindb.errors import few_names, input_error
 
 if TYPE_CHECKING:
     from skindb.store import Database
@@ -181,8 +181,7 @@ def stale_as_json(result: Refreshed) -> dict[str, Any]:
 
 def _line(result: Refreshed) -> str:
     name = result.name
-    reasons = "; ".join(result.reasons[:3])
-    reasons += f" and {len(result.reasons) - 3} more" if len(result.reasons) > 3 else ""
+    reasons = few_names(result.reasons, separator="; ")
     if result.record is not None:
         return f"{name} -> {result.record.generation} ({reasons})"
     return f"{name}: {reasons}" + (

@@ -81,11 +81,8 @@ from skindb.ingest.surfels import (
 from skindb.parameters import IngestParameters
 from skindb.types import Float64, Half, Progress, silent
 
-# with two, one reads while the other computes
-# correlation of slopes across; faces and objects have 0.3 to 0.7, with one axis of the lights
-# mirrored -0.3 to -0.7
-MIN_INTEGRABILITY = -0.1
-MIN_THREADS = 2
+MIN_BACKGROUND = 0.01  # of the picture, from which it is noted
+MIN_THREADS = 2  # with two, one reads while the other computes
 MAX_THREADS = 8
 MAX_BYTES = 4 << 30  # of memory for all threads together, unless two threads need more
 
@@ -236,10 +233,15 @@ class _Run:
                 f"the points of the scan are {spacing:.2g} mm apart; a wider spacing leaves "
                 "the scan unchanged"
             )
-        if self.relief is not None and self.relief.integrability < MIN_INTEGRABILITY:
+        if self.relief is not None and self.relief.background > MIN_BACKGROUND:
             notes.append(
-                "the lights seem to be mirrored, as no surface has these normals: check that "
-                "x of their directions is to the right, y up and z to the camera"
+                f"{self.relief.background:.0%} of the picture is a dark background with noise "
+                "and is excluded; a mask states the subject"
+            )
+        if self.relief is not None and self.relief.wrong_axes:
+            notes.append(
+                f"the lights seem to be {self.relief.wrong_axes}: check that x of their "
+                "directions is to the right, y up and z to the camera"
             )
         if self.relief is not None and spacing > 1.5 * self.parameters.spacing_mm:
             notes.append(

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from skindb.calibration.lights import ball_outline, distant_light, highlight_centre
-from skindb.errors import Fault, InputError, attempt, require
+from skindb.errors import Fault, InputError, attempt, few_names, require
 from skindb.files import make_private, private_file, read_regular
 from skindb.format.dome import EXPOSURE_RATIO
 from skindb.format.fields import IDENTIFIER, Fields, short
@@ -33,10 +33,9 @@ from skindb.ingest.picture_files import (
     exif_exposure,
     read_picture,
 )
+from skindb.ingest.relief import MIN_LIGHTS, MIN_SPREAD
 from skindb.ingest.stage_cameras import read_cameras
-from skindb.limits import (
-    MAX_SCAN_BYTES,
-)
+from skindb.limits import MAX_SCAN_BYTES
 from skindb.parameters import ImportParameters
 from skindb.types import Mask, Progress, silent
 
@@ -118,12 +117,15 @@ def import_images(
     )
     notes = []
     if chosen.mirror_ball is not None:
-        table = _from_ball(chosen.mirror_ball, files)
+        place = chosen.mirror_ball
+        table = _from_ball(place, files)
         notes.append(f"{len(table)} directions of lights from the mirror ball")
     else:
-        table = read_lights(_table_file(source, chosen.lights))
+        place = _table_file(source, chosen.lights)
+        table = read_lights(place)
     matched = _matched(source, files, table)
-    frames = _Frames(out, matched[0], chosen.response)
+    notes += _require_directions(place, table)
+    frames = _Frames(out, _typical(matched), chosen.response)
     height, width = frames.size
     inside = _mask(chosen.mask or _only(masks), frames.size)
     width_mm = chosen.width_mm
@@ -132,8 +134,8 @@ def import_images(
         notes.append(
             f"the picture is taken as {width_mm:.0f} mm wide on the subject; --width states it"
         )
-    if unused := len(files) - len(matched):
-        notes.append(f"{unused} pictures have no light and are not used")
+    if unused := [file.name for file in files if file not in matched]:
+        notes.append(f"pictures without a light are not used: {few_names(unused)}")
     ids = _ids([light.name for light in table])
     camera = _distant_camera(width, height, width_mm)
     with _whole(out):
@@ -463,13 +465,44 @@ def _matched(source: Path, files: Sequence[Path], table: Sequence[Light]) -> lis
     if faults:
         raise InputError(faults)
     require(
-        len(pairs) >= 3,
+        len(pairs) >= MIN_LIGHTS,
         str(source),
-        "normals need pictures under three lights or more",
-        f"{len(pairs)}",
+        f"normals need pictures under {MIN_LIGHTS} lights or more",
+        few_names([file.name for file in pairs]),
         "photograph the subject under more lights",
     )
     return pairs
+
+
+def _require_directions(place: Path, table: Sequence[Light]) -> list[str]:
+    """Require lights in front of the subject and not in a plane; a note on those behind."""
+    way = np.array([light.vector / np.linalg.norm(light.vector) for light in table])
+    behind = [light.name for light in table if light.vector[2] <= 0]
+    require(
+        len(table) - len(behind) >= MIN_LIGHTS,
+        str(place),
+        f"{MIN_LIGHTS} lights or more must be in front of the subject, with z above 0",
+        f"{len(behind)} of {len(table)} behind it: {few_names(behind)}",
+        "write directions from the subject to the lights, with z to the camera",
+    )
+    spread = np.linalg.eigvalsh(way.T @ way)
+    require(
+        spread[0] > MIN_SPREAD * spread[2] or not all(x.distant for x in table),
+        str(place),
+        "directions of the lights must not be in a plane, or nearly equal",
+        f"{len(table)} directions that are",
+        "add lights elsewhere, or correct the columns x, y, z",
+    )
+    return [f"lights behind the subject, z not above 0: {few_names(behind)}"] * any(
+        behind
+    )
+
+
+def _typical(files: Sequence[Path]) -> Path:
+    """The first picture whose kind most of the first three have."""
+    pictures = [read_picture(file) for file in files[:3]]
+    kinds = [(picture.shape, picture.dtype) for picture in pictures]
+    return files[kinds.index(max(kinds, key=kinds.count))]
 
 
 def _folded(name: str) -> str:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import xarray as xr
 
-from skindb.errors import Fault, InputError, input_error
+from skindb.errors import Fault, InputError, few_names, input_error
 from skindb.schema.label import label, text_labels
 from skindb.schema.notes import note
 from skindb.schema.variables import VARIABLES
@@ -313,13 +313,6 @@ def require_same_fit(cohort: xr.Dataset) -> None:
             )
     if faults:
         raise InputError(faults)
-
-
-def few_names(takes: Sequence[str]) -> str:
-    """Names for a message: the first three, and how many more there are."""
-    return ", ".join(takes[:3]) + (
-        f" and {len(takes) - 3} more" if len(takes) > 3 else ""
-    )
 
 
 def _all_labels(

@@ -6,8 +6,8 @@ from typing import Any
 
 import pandas as pd
 
-from skindb.errors import InputError, SkindbWarning
-from skindb.schema.cohort import column, few_names, imitates_column, take_coords
+from skindb.errors import InputError, SkindbWarning, few_names
+from skindb.schema.cohort import column, imitates_column, take_coords
 from skindb.schema.consent import CONSENT, consent_scope
 from skindb.store.condition import evaluate, is_missing
 from skindb.store.entries import CACHED_KINDS

@@ -11,13 +11,12 @@ from typing import Any, Literal
 import numpy as np
 import xarray as xr
 
-from skindb.errors import Fault, InputError, input_error, require
+from skindb.errors import Fault, InputError, few_names, input_error, require
 from skindb.schema.cohort import (
     Part,
     Source,
     Values,
     combine,
-    few_names,
     one_take_each,
     take_coords,
     values_of,

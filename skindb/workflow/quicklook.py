@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from dataclasses import asdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from skindb.errors import require
+from skindb.errors import InputError, require
 from skindb.files import make_private, private_file, private_umask
 from skindb.fit.plan import RELATIVE
 from skindb.format.fields import read_json
@@ -94,7 +96,11 @@ def quick(
     fit = FitParameters(eta=known.pop("eta"))
     consent = {"scope": ["fit", "export"], "reference": "quick, nothing is stored"}
     _remove_left()
-    with private_umask(), tempfile.TemporaryDirectory(prefix=PREFIX) as folder:
+    with (
+        private_umask(),
+        tempfile.TemporaryDirectory(prefix=PREFIX) as folder,
+        _naming(source, folder),
+    ):
         # which a killed run leaves
         private_file(Path(folder) / PROCESS).write_text(json.dumps(this_process()))
         capture = Path(folder) / "capture"
@@ -116,8 +122,22 @@ def quick(
         view_takes(db, [record.take], out / PAGE, progress=progress)
         model = db.read("model", record.take)
         result = _write_maps(model, out, step)
-    notes = [*imported.notes, RELATIVE]
+    notes = [*imported.notes, *record.provenance["summary"]["notes"], RELATIVE]
     return {"files": [str(out / name) for name in names], "notes": notes} | result
+
+
+@contextmanager
+def _naming(source: str | Path, folder: str) -> Iterator[None]:
+    """Context whose faults in the temporary folder are those of the source."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(
+            replace(fault, where=str(source))
+            if fault.where.startswith(folder)
+            else fault
+            for fault in error.faults
+        ) from None
 
 
 def _remove_left() -> None:

@@ -85,6 +85,20 @@ def test_three_lights_are_enough(tmp_path: Path) -> None:
     assert "lambert 100.0%" in result.stdout
 
 
+def test_quick_names_the_pictures_of_the_user(pictures: Path, tmp_path: Path) -> None:
+    write_pictures(pictures, LIGHTS, albedo=(0.0, 0.0, 0.0))
+    result = run("quick", pictures, tmp_path / "out", "--no-progress")
+    assert result.returncode == 1
+    assert f"{pictures}: at least 3 lights" in result.stderr
+
+
+def test_quick_reports_notes_of_the_ingest(pictures: Path, tmp_path: Path) -> None:
+    names = [f"picture {k}.png" for k in range(len(LIGHTS))]
+    write_table(pictures / "lights.csv", names, LIGHTS * [-1, 1, 1])
+    result = run("quick", pictures, tmp_path / "out", "--no-progress")
+    assert "note: the lights seem to be mirrored" in result.stderr
+
+
 def test_import_then_ingest_and_fit(pictures: Path, tmp_path: Path) -> None:
     capture = tmp_path / "capture"
     person = ["--subject", "3", "--consent", "fit", "--reference", "form 1"]
