@@ -233,8 +233,9 @@ def test_cli__every_command_has_help_and_the_common_options(command):
         (
             ("render", "{tmp}/full", "X", "Y", "--out", "{tmp}/x.png"),
             1,
-            "a file must hold one take",
+            "2 takes: X, Y; name one take",
         ),
+        (("fit", "{tmp}/full", "-x"), 2, "A name that begins with - follows after --."),
         (
             ("export", "{tmp}/full", "X", "--out", "{tmp}/x.glb"),
             1,

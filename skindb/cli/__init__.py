@@ -166,6 +166,8 @@ def main() -> None:
     except click.ClickException as error:
         stream = io.StringIO()
         error.show(stream)
+        if isinstance(error, click.NoSuchOption) and error.option_name[1:2] != "-":
+            stream.write("A name that begins with - follows after --.\n")
         echo(*stream.getvalue().expandtabs(2).splitlines(), err=True)
         context = getattr(error, "ctx", None)
         command = context.command_path if context else "skindb"

@@ -22,7 +22,7 @@ from click.core import ParameterSource
 import skindb
 from skindb.cli.options import asked
 from skindb.cli.terminal import Progress, echo
-from skindb.errors import Fault, InputError, input_error, require
+from skindb.errors import Fault, InputError, few_names, input_error, require
 from skindb.files import plain
 
 if TYPE_CHECKING:
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from skindb.view.page import PageServer
     from skindb.workflow import Outcome
 
+MAX_NAMES = 10  # in a message
 MAX_ALIKE = 10  # faults that break the same rule and are printed
 P = TypeVar("P", Path, Path | None)
 T = TypeVar("T")
@@ -288,8 +289,8 @@ def require_one_take(out: Path, takes: Sequence[str]) -> None:
         len(takes) <= 1,
         str(out),
         "a file must hold one take",
-        f"{len(takes)} takes",
-        "name a folder, or one take",
+        f"{len(takes)} takes: {few_names(takes, MAX_NAMES)}",
+        "name one take, or a folder for all",
     )
 
 

@@ -201,9 +201,9 @@ def choose_corrections(
         for n, m in zip(counts, (MIN_LIGHTS, MIN_CAMERAS, MIN_SURFELS), strict=True)
     ):
         reason = (
-            "off: {} lights, {} cameras and {} surfels are too few to choose".format(
-                *counts
-            )
+            f"off: a choice needs {MIN_LIGHTS} lights, {MIN_CAMERAS} cameras and "
+            f"{MIN_SURFELS} surfels of {MIN_SAMPLES} samples; found "
+            "{}, {} and {}".format(*counts)
         )
         return off, dict.fromkeys(undecided, reason)
     rng = np.random.default_rng([parameters.seed, STREAM])

@@ -26,7 +26,7 @@ FORMATS = "PNG, TIFF, JPEG, BMP or OpenEXR"
 
 def read_picture(path: Path) -> Picture:
     """A picture (h, w, 3) as it is looked at: uint8, uint16 or float radiance; grey is
-    repeated, transparency dropped, and the orientation of JPEG files applied.
+    repeated, what is transparent is black, and the orientation of JPEG files applied.
 
     Raises
     ------
@@ -39,7 +39,7 @@ def read_picture(path: Path) -> Picture:
     try:
         # by its content, as names may be wrong
         if content.startswith(b"\x89PNG"):
-            picture = np.asarray(imagecodecs.png_decode(content))
+            picture = _png(content)
         elif content[:4] in (b"II*\0", b"MM\0*"):
             picture = _tiff(content)
         else:
@@ -61,9 +61,10 @@ def read_picture(path: Path) -> Picture:
             short(str(error)),
             "export it as PNG, JPEG or plain TIFF; raw and HEIC files have to be converted",
         ) from None
-    if picture.shape[2] < 3:
-        picture = np.repeat(picture[..., :1], 3, axis=2)
-    return np.array(picture[..., :3])
+    colour = picture[..., : 3 if picture.shape[2] > 2 else 1]
+    if picture.shape[2] in (2, 4):  # what has no opacity has any colour
+        colour = np.where(picture[..., -1:] > 0, colour, 0)
+    return np.array(np.broadcast_to(colour, (height, width, 3)))
 
 
 def exif_exposure(path: Path) -> tuple[float, bool]:
@@ -89,6 +90,15 @@ def exif_exposure(path: Path) -> tuple[float, bool]:
     ) == 0
 
 
+def _png(content: bytes) -> Picture:
+    """A PNG file; `ValueError` if its EXIF turns it."""
+    if b"eXIf" in content:
+        with Image.open(io.BytesIO(content), formats=("PNG",)) as image:
+            if image.getexif().get(ExifTags.Base.Orientation, 1) != 1:
+                raise ValueError("a turned picture")
+    return np.asarray(imagecodecs.png_decode(content))
+
+
 def _tiff(content: bytes) -> Picture:
     """The only page of a TIFF; `ValueError` for what would be read wrongly."""
     with tifffile.TiffFile(io.BytesIO(content)) as file:
@@ -98,6 +108,8 @@ def _tiff(content: bytes) -> Picture:
             "several pages": len(file.pages) > 1,
             "a palette or inverted values": page.photometric
             not in (tifffile.PHOTOMETRIC.RGB, tifffile.PHOTOMETRIC.MINISBLACK),
+            f"{page.bitspersample} bits": page.bitspersample not in (8, 16),
+            "a channel that is no opacity": not {1, 2}.issuperset(page.extrasamples),
             "separate planes": page.ndim > 2 and page.planarconfig != 1,
             "a turned picture": orientation is not None and orientation.value != 1,
         }

@@ -86,7 +86,7 @@ def test_choose_corrections__small_captures_support_none(new_skin):
         skin = new_skin(**({"surfels": 400, "lights": LIGHTS, "cameras": 6} | size))
         parameters, reasons = _choose(skin)
         assert (parameters.light_gains, parameters.inter_reflection) == (False, False)
-        assert all("too few to choose" in reason for reason in reasons.values())
+        assert all("needs 16 lights" in reason for reason in reasons.values())
 
 
 def test_choose_corrections__options_force_either_way(large):

@@ -346,17 +346,42 @@ def test_formats_that_would_be_read_wrongly(tmp_path: Path) -> None:
         "inverted": {"photometric": "miniswhite"},
         "turned": {"photometric": "rgb", "extratags": [(274, "H", 1, 6, True)]},
         "float": {"photometric": "rgb"},
+        "bits": {"photometric": "rgb", "bitspersample": 12},
+        "infrared": {"photometric": "rgb", "extrasamples": ["unspecified"]},
     }
     for name, option in options.items():
         picture = {
             "planes": np.moveaxis(colour, 2, 0),
             "inverted": values,
             "float": colour.astype(np.float32),
+            "infrared": colour[..., [0, 1, 2, 0]],
         }.get(name, colour)
         path = tmp_path / f"{name}.tif"
         tifffile.imwrite(path, picture, **option)
         with pytest.raises(InputError, match="plain TIFF"):
             read_picture(path)
+
+
+def test_what_is_transparent_is_black(tmp_path: Path) -> None:
+    cut = np.full((4, 6, 4), 255, np.uint8)
+    cut[:, :3, 3] = 0
+    options = {"extrasamples": ["unassalpha"], "photometric": "rgb"}
+    tifffile.imwrite(tmp_path / "cut.tif", cut, **options)
+    Image.fromarray(cut).save(tmp_path / "cut.png")
+    for path in tmp_path.iterdir():
+        picture = read_picture(path)
+        assert picture.shape == (4, 6, 3)
+        assert (picture[:, :3] == 0).all()
+        assert (picture[:, 3:] == 255).all()
+
+
+def test_turned_png_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "turned.png"
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    Image.new("RGB", (4, 6)).save(path, exif=exif)
+    with pytest.raises(InputError, match="a turned picture"):
+        read_picture(path)
 
 
 def test_masks_and_repeated_pictures_are_not_guessed(
