@@ -228,7 +228,7 @@ def test_ingest__of_several_captures_is_one_entry(tmp_path):
     [entry] = db.audit()[0]
     assert (entry.action, entry.counts) == ("ingest", {"captures": 3})
     assert entry.subjects == [subject_hash(Folder(db.root), "V001")]
-    assert _run("ingest", str(db.root), takes[0], "--spacing", "8").returncode == 0
+    assert _run("ingest", str(db.root), takes[0], "--spacing", "7").returncode == 0
     assert [entry.counts for entry in db.audit(subject="V001")[0]] == [
         {"captures": 3},
         {"takes": 1},

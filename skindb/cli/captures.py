@@ -162,6 +162,11 @@ def _simulated(simulated: tuple[int, Path]) -> tuple[str, Any, list[str]]:
     ),
 )
 @click.option(
+    "--again",
+    is_flag=True,
+    help="Also ingest captures of which the newest version would not change.",
+)
+@click.option(
     "--explain",
     is_flag=True,
     help="Report what was cleaned (with -v also where) and what was skipped.",
@@ -176,6 +181,7 @@ def ingest(
     crop_box: tuple[float, float, float, float, float, float] | None,
     crop_reach: float | None,
     new_consent: datetime | None,
+    again: bool,
     explain: bool,
     wait: float,
     workers: int,
@@ -186,8 +192,9 @@ def ingest(
 
     The database is created if it is absent. A folder with faults is not committed, and
     does not stop the others. An interrupted ingest leaves no incomplete version, and
-    the same command resumes it. A capture of a subject who was withdrawn is refused,
-    unless --new-consent states a new consent.
+    the same command resumes it. Nothing is done if the newest version was made of the
+    same files, with the same parameters, by the same code. A capture of a subject who
+    was withdrawn is refused, unless --new-consent states a new consent.
     """
     if new_consent is not None and len(captures) > 1:
         raise input_error(
@@ -201,8 +208,9 @@ def ingest(
     progress = bar()
     database = skindb.open(db)
     call = partial(
-        skindb.workflow.ingest_take,
+        skindb.workflow.ingest_if_changed,
         database,
+        again=again,
         crop=crop,
         new_consent=None if new_consent is None else new_consent.date(),
         wait=wait,
@@ -241,9 +249,13 @@ def _logged(
 
 
 def _ingested(
-    database: Database, record: Record, *, explain: bool
+    database: Database, result: tuple[Record, bool], *, explain: bool
 ) -> tuple[str, Any, list[str]]:
-    """Name, JSON record and printed lines of a capture that was committed."""
+    """Name, JSON record and printed lines of a capture that was ingested or is unchanged."""
+    record, is_new = result
+    if not is_new and not explain:
+        line = f"{record.take}: unchanged since capture {record.generation}; --again ingests it"
+        return record.take, summary_of(record), [line]
     if keys := record.provenance["unknown_keys"]:
         echo(
             (

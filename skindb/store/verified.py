@@ -71,7 +71,7 @@ def read_manifest(place: Place, record: Record) -> Manifest:
             place.where(record.beside("manifest")),
             "a manifest must list the size and the digests of every file",
             "that of another release of skindb",
-            "compute the version again: skindb ingest, then skindb fit --refit",
+            "compute the version again: skindb ingest --again, then skindb fit --refit",
         ) from None
 
 

@@ -18,7 +18,13 @@ from .administration import (
     write_erasure_report,
 )
 from .audit import NotLoggedWarning, acting_as, logged_action
-from .captures import calibrate, captured_subjects, describe_calibration, ingest_take
+from .captures import (
+    calibrate,
+    captured_subjects,
+    describe_calibration,
+    ingest_if_changed,
+    ingest_take,
+)
 from .cohorts import register_takes, registered_datasets, summarise
 from .edits import basis_grid, edit, edit_grid
 from .fit import (
@@ -90,6 +96,7 @@ __all__ = [
     "faults_of",
     "fit_take",
     "fit_with",
+    "ingest_if_changed",
     "ingest_take",
     "kept_parameters",
     "landmark_page",

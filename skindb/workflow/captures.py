@@ -5,7 +5,7 @@ dated, versioned, and named by the captures that used them.
 import shutil
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -30,9 +30,10 @@ from skindb.calibration.setup import (
     read_setup_dome,
 )
 from skindb.errors import Fault, InputError, add_filename, input_error, require
-from skindb.files import private_file
+from skindb.files import plain, private_file
 from skindb.format.dome import DomeRecord
 from skindb.format.fields import NAME, read_json
+from skindb.format.frames import Digests
 from skindb.ingest import (
     Capture,
     Crop,
@@ -41,6 +42,7 @@ from skindb.ingest import (
     read_capture,
     scratch_name,
 )
+from skindb.ingest.report import capture_provenance
 from skindb.ingest.spool import remove_stale
 from skindb.parameters import CalibrationParameters
 from skindb.schema import variables
@@ -57,7 +59,7 @@ from skindb.threads import one_blas_thread
 from skindb.types import Progress
 from skindb.workflow.administration import superseded_calibrations
 from skindb.workflow.audit import logged_action
-from skindb.workflow.derive import groups_of
+from skindb.workflow.derive import code_digest, groups_of
 
 NOTE = "stage"  # file in the scratch folder: path of the data that this run writes
 RIG = "rig_calibration"  # group of a calibration from takes
@@ -70,16 +72,7 @@ APPLIED: dict[str, Callable[..., DomeRecord]] = {
 }
 
 
-def ingest_take(
-    db: Database,
-    folder: str | Path,
-    *,
-    crop: Crop | None = None,
-    new_consent: date | None = None,
-    wait: float = 0.0,
-    progress: Progress | None = None,
-    **parameters: Any,
-) -> Record:
+def ingest_take(db: Database, folder: str | Path, **options: Any) -> Record:
     """Ingest a capture folder and commit it; killed at any point, the same call
     continues where it was.
 
@@ -89,17 +82,13 @@ def ingest_take(
         Database to write to.
     folder
         Capture folder, format version 1.
-    crop
-        What to keep of the scan: a box, the surroundings of the landmarks; None for all of it.
-    new_consent
-        Date on which a subject who was withdrawn consented again; the scopes are those
-        of the capture.
-    wait
-        Seconds to wait for another run that ingests or fits the same take.
-    progress
-        Called with the stage, the number of finished steps and the total number of steps.
-    **parameters
-        Of `skindb.ingest.IngestParameters`: spacing_mm, photographs, calibration,
+    **options
+        `crop`: what to keep of the scan, a box or the surroundings of the landmarks, by
+        default all of it. `new_consent`: date on which a subject who was withdrawn
+        consented again; the scopes are those of the capture. `wait`: seconds to wait
+        for another run that ingests or fits the same take. `progress`: called with the
+        stage, the number of finished steps and the total number of steps. Others are
+        those of `skindb.ingest.IngestParameters`: spacing_mm, photographs, calibration,
         refine.
 
     Returns
@@ -114,6 +103,24 @@ def ingest_take(
         consent to fit, if another run ingests or fits the take, or if the subject was
         withdrawn and no new consent is given.
     """
+    return ingest_if_changed(db, folder, again=True, **options)[0]
+
+
+def ingest_if_changed(
+    db: Database,
+    folder: str | Path,
+    *,
+    again: bool = False,
+    crop: Crop | None = None,
+    new_consent: date | None = None,
+    wait: float = 0.0,
+    progress: Progress | None = None,
+    **parameters: Any,
+) -> tuple[Record, bool]:
+    """The record of a capture folder that is ingested, as by `ingest_take`, and True; or of
+    the newest capture and False, if it was made of the same files, with the same
+    parameters, by the same code. With `again` it is always ingested.
+    """
     database = None if db.folder is None else db.folder.resolve()
     require(
         database is None or Path(folder).resolve() not in (database, *database.parents),
@@ -125,6 +132,10 @@ def ingest_take(
     capture = calibrated_capture(db, read_capture(folder, crop=crop))
     capture = _with_note_of_session(db, capture)
     record = IngestParameters(**parameters)
+    if not again and new_consent is None:
+        stored = _unchanged(db, capture, record)
+        if stored is not None:
+            return stored, False
     scratch = db.scratch() / scratch_name(capture, record)
     with logged_action(
         db, "ingest", [capture.take], arguments={"new_consent": new_consent is not None}
@@ -136,10 +147,25 @@ def ingest_take(
             db.readmit(subject_of(capture.take), new_consent)
         remove_stale(scratch)
         try:
-            return _ingest(db, capture, record, scratch, wait, progress)
+            return _ingest(db, capture, record, scratch, wait, progress), True
         except (OSError, InputError):
             _require_admitted(db, capture.take, scratch)
             raise
+
+
+def _unchanged(
+    db: Database, capture: Capture, parameters: IngestParameters
+) -> Record | None:
+    """The newest version of a capture if an ingest would make it again."""
+    if not db.has("capture", capture.take):
+        return None
+    record = db.record("capture", capture.take)
+    stored = record.provenance
+    if stored.get("code_digest") != code_digest(ingest_capture):
+        return None
+    expected = plain(capture_provenance(capture, asdict(parameters), Digests()))
+    same = all(stored[key] == expected[key] for key in ("inputs", "parameters"))
+    return record if same else None
 
 
 def _with_note_of_session(db: Database, capture: Capture) -> Capture:
@@ -202,9 +228,9 @@ def _ingest(
                 stage.write(groups_of(tree))
                 if progress is not None:
                     progress("write", 1, 1)
-                return stage.commit(
-                    {str(name): value for name, value in tree.attrs.items()}
-                )
+                provenance = {str(name): value for name, value in tree.attrs.items()}
+                digest = {"code_digest": code_digest(ingest_capture)}
+                return stage.commit(provenance | digest)
 
 
 def _require_admitted(db: Database, take: str, scratch: Path) -> None:

@@ -19,6 +19,7 @@ import skindb
 from skindb.analysis import STUDIES
 from skindb.cli import main
 from skindb.errors import InputError
+from skindb.format.frames import read_frame, write_frame
 from skindb.ingest import import_images
 from skindb.render.image import read_exr, read_png
 from skindb.store.lease import this_process
@@ -113,6 +114,34 @@ def test_import_then_ingest_and_fit(pictures: Path, tmp_path: Path) -> None:
         assert result.returncode == 0, result.stderr
     result = run("info", tmp_path / "db")
     assert "3" in result.stdout
+
+
+def test_a_capture_that_is_unchanged_is_not_stored_again(
+    pictures: Path, tmp_path: Path
+) -> None:
+    capture = tmp_path / "capture"
+    consent = {"scope": ["fit"], "reference": "form"}
+    import_images(pictures, capture, {"subject": "P1", "consent": consent})
+    db = skindb.open(str(tmp_path / "db"))
+    words = ["ingest", tmp_path / "db", capture, "--no-progress", "--spacing"]
+
+    def ingested(*more: object) -> tuple[int, bool]:
+        """The newest generation, and whether it is said to be unchanged."""
+        result = run(*words, *more)
+        assert result.returncode == 0, result.stderr
+        unchanged = "P1: unchanged since capture" in result.stdout
+        return db.record("capture", "P1").generation, unchanged
+
+    assert ingested(8) == (1, False)
+    assert ingested(8) == (1, True)
+    assert ingested(8, "--again") == (2, False)
+    assert ingested(9) == (3, False)
+    (frame, *_) = (capture / "dome/frames").iterdir()
+    write_frame(frame, read_frame(frame) // 2)
+    assert ingested(9) == (4, False)
+    record = json.loads((capture / "capture.json").read_text())
+    (capture / "capture.json").write_text(json.dumps(record | {"age": 30}))
+    assert ingested(9) == (5, False)
 
 
 @pytest.mark.parametrize(
