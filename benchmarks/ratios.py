@@ -1,10 +1,12 @@
 """Times of skindb beside those of peers that do the same work, in one run.
 
     python -m benchmarks ratios [--only ROW...] [--json ratios.json] [--page docs/performance.md]
+    python -m benchmarks ratios --quick
 
 Every row measures skindb and its peer one after the other on this machine, so that
 their ratio is meaningful although absolute times vary. `--page` replaces the table
-between the marks of a page. The first run also compiles.
+between the marks of a page, `--quick` takes less than a minute. The first run also
+compiles.
 """
 
 from __future__ import annotations
@@ -52,6 +54,11 @@ END = "<!-- end of ratios -->"
 TAKES = 8
 STUDY_TAKES = 16
 SURFELS = 1_000_000
+FRAMES = {
+    "small": {"cameras": 6, "lights": 32, "width": 325, "height": 258},
+    "full-size": {"cameras": 4, "lights": 16, "width": 1300, "height": 1030},
+}
+FEW_FRAMES = {"full-size": FRAMES["full-size"] | {"lights": 8}}
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 
 
@@ -69,9 +76,12 @@ class Row:
 
 @dataclass(frozen=True)
 class Bench:
-    """Folder of a run, with captures and a database of small takes."""
+    """Folder of a run, with captures and a database of small takes; captures of `frames` are
+    ingested.
+    """
 
     folder: Path
+    frames: dict[str, dict[str, int]]
 
     def captures(self, name: str, takes: int, **parameters: int) -> list[Path]:
         """Virtual captures; simulated by the first call."""
@@ -178,11 +188,7 @@ def merged(folder: Path, out: Path) -> Path:
 def ingesting(bench: Bench) -> list[Row]:
     """Ingest of small and large frames, over decoding them once."""
     rows = []
-    sizes = {
-        "small": {"cameras": 6, "lights": 32, "width": 325, "height": 258},
-        "full-size": {"cameras": 4, "lights": 16, "width": 1300, "height": 1030},
-    }
-    for name, size in sizes.items():
+    for name, size in bench.frames.items():
         [folder] = bench.captures(name, 1, **size)
         exr = merged(folder, bench.folder / f"{name}-exr")
         for capture, kind in ((folder, "PNG"), (exr, "OpenEXR")):
@@ -413,6 +419,7 @@ def main(
     work: Annotated[
         Path | None, "Folder for captures and databases, which are kept there."
     ] = None,
+    quick: Annotated[bool, "The ingest of few frames alone."] = False,
 ) -> None:
     """Measure, print and write; with `only`, other rows of the JSON file are kept."""
     rows = dict[str, Row]()
@@ -421,8 +428,8 @@ def main(
         rows = {row["work"]: Row(**row) for row in earlier}
     start = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
-        bench = Bench(work or Path(folder))
-        for name in only or ROWS:
+        bench = Bench(work or Path(folder), FEW_FRAMES if quick else FRAMES)
+        for name in only or (["ingest"] if quick else ROWS):
             begin = time.monotonic()
             found = ROWS[name](bench)
             rows |= {row.work: row for row in found}

@@ -75,10 +75,11 @@ def undo_filters(content: ByteMatrix, step: int, swap: int, out: ByteMatrix) -> 
             for i in range(size):
                 line[i ^ swap] = row[i]
         elif kind == 1:
-            for i in range(step):
-                line[i ^ swap] = row[i]
-            for i in range(step, size):
-                line[i ^ swap] = row[i] + line[(i - step) ^ swap]
+            for start in range(step):  # the sum stays in a register
+                total = np.int64(0)
+                for i in range(start, size, step):
+                    total += row[i]
+                    line[i ^ swap] = total
         elif kind == 2:
             for i in range(size):
                 line[i ^ swap] = row[i] + above[i ^ swap]

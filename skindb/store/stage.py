@@ -40,6 +40,7 @@ from skindb.store.place import (
     VERSION,
     Place,
     UnavailableError,
+    in_parallel,
     require_text,
 )
 from skindb.store.record import (
@@ -290,11 +291,11 @@ class Stage:
                 f"that another process removed {', '.join(gone)}",
                 "run the command again",
             )
-        return {
-            name: Committed(size, self.place.digests(f"{self.path}/{name}"))
-            for name, size in sorted(sizes.items())
-            if size >= 0
-        }
+        files = {name: size for name, size in sorted(sizes.items()) if size >= 0}
+        digests = in_parallel(
+            lambda name: self.place.digests(f"{self.path}/{name}"), files
+        )
+        return dict(zip(files, map(Committed, files.values(), digests), strict=True))
 
     def _require_names(self, provenance: Mapping[str, Any]) -> list[str]:
         """The other takes that the version refers to, which must have been named when
