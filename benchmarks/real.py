@@ -124,6 +124,20 @@ def samples_of(photographs: Photographs, chosen: NDArray[np.intp]) -> xr.Dataset
 def skindb_fit(photographs: Photographs, training: Mask, *, eta: float) -> Fitted:
     """Normals, R_d, dictionary and reduced basis of skindb, and the predictions of the model."""
     samples = samples_of(photographs, np.flatnonzero(training))
+    samples, predict = fitted_samples(samples, eta=eta)
+    predicted = predict(photographs.light, np.array([0.0, 0.0, 1.0]))
+    normal = samples["shading_normal"].values.astype(np.float64)
+    errors = (samples[name].values for name in ("normal_error", "normal_total_error"))
+    return Fitted(normal, predicted, *errors)
+
+
+def fitted_samples(
+    samples: xr.Dataset, *, eta: float
+) -> tuple[xr.Dataset, Callable[[Array, Array], Array]]:
+    """The lumitexels of one camera with normals and R_d, without a scan, and the
+    prediction by the reduced basis of samples (n, light), NaN for pixels without a
+    normal, from directions ([n,] light, 3) to lights and ([n,] 3) to a camera.
+    """
     dictionary = embedded_dictionary()
     samples = samples.merge(
         estimate_normals(samples, eta=eta, scan_error=NO_SCAN_DEGREES)
@@ -142,11 +156,8 @@ def skindb_fit(photographs: Photographs, training: Mask, *, eta: float) -> Fitte
     weight = np.nan_to_num(refit(samples, basis=basis, eta=eta)["basis_weight"].values)
     normal = samples["shading_normal"].values.astype(np.float64)
     diffuse = samples["diffuse_reflectance"].values.mean(axis=1)
-    predicted = _predicted(
-        normal, diffuse, weight, kernel_tables(basis), photographs.light, eta
-    )
-    errors = (samples[name].values for name in ("normal_error", "normal_total_error"))
-    return Fitted(normal, predicted, *errors)
+    table = kernel_tables(basis)
+    return samples, partial(_predicted, normal, diffuse, weight, table, eta)
 
 
 def _predicted(
@@ -154,23 +165,21 @@ def _predicted(
     diffuse: Array,
     weight: Array,
     table: NDArray[np.float32],
-    light: Array,
     eta: float,
+    light: Array,
+    view: Array,
 ) -> Array:
-    """Samples (n, light) of the model; NaN for pixels without a normal."""
+    """See `fitted_samples`."""
     unknown = ~np.isfinite(normal).all(axis=1) | ~np.isfinite(diffuse)
     normal = np.where(unknown[:, None], [0.0, 0.0, 1.0], normal)
-    view = np.array([0.0, 0.0, 1.0])
-    seen = np.clip(normal @ view, 1e-3, 1)
+    view = np.broadcast_to(view, normal.shape)
+    seen = np.clip((normal * view).sum(axis=1), 1e-3, 1)
     through = fresnel_transmittance(seen, eta) * diffuse / np.pi
     columns = []
-    for direction in light:
-        lit = np.clip(normal @ direction, 0, 1)
-        angles = half_difference(
-            np.broadcast_to(direction, normal.shape),
-            np.broadcast_to(view, normal.shape),
-            normal,
-        )
+    for k in range(light.shape[-2]):
+        direction = np.broadcast_to(light[..., k, :], normal.shape)
+        lit = np.clip((normal * direction).sum(axis=1), 0, 1)
+        angles = half_difference(direction, view, normal)
         surface = (lookup(table, *angles) * weight).sum(axis=1)
         matt = through * fresnel_transmittance(np.maximum(lit, 1e-3), eta)
         columns.append(lit * (matt + surface))

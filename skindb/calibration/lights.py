@@ -515,8 +515,9 @@ def rig_positions(rig: xr.Dataset) -> dict[str, Float64]:
 
 
 def rig_dome(dome: DomeRecord, calibration: xr.Dataset, *, where: str) -> DomeRecord:
-    """The dome with the gains and offsets of the lights, and gains of the cameras, by a
-    calibration from takes; lights and cameras that it does not have keep their own.
+    """The dome with the gains and offsets of the lights, gains of the cameras, and lobes
+    of the skin, by a calibration from takes; lights and cameras that it does not have
+    keep their own.
 
     Raises
     ------
@@ -553,7 +554,10 @@ def rig_dome(dome: DomeRecord, calibration: xr.Dataset, *, where: str) -> DomeRe
         replace(camera, gain=tuple(gain.tolist()))
         for camera, gain in zip(dome.cameras, sensitivity.values, strict=True)
     )
-    return replace(dome, lights=tuple(lights), cameras=tuple(cameras))
+    lobes = calibration["rig_lobe_strength"].dropna("lobe").values
+    return replace(
+        dome, lights=tuple(lights), cameras=tuple(cameras), lobes=tuple(lobes.tolist())
+    )
 
 
 def calibrate_positions(dome: DomeRecord, ball: BallFrames) -> xr.Dataset:

@@ -100,9 +100,9 @@ def calibrate(
     frames for them exist. If it holds contact/calibration.json, the fibres of the probe
     are located and their gains measured.
 
-    With --from-takes, no set-up is needed: the gains and directions of the lights are
-    what three or more fitted takes have in common. Captures with the same lights use
-    them when they are ingested.
+    With --from-takes, no set-up is needed: the gains and directions of the lights, and
+    the gloss of the skin, are what three or more fitted takes have in common. Captures
+    with the same lights use them when they are ingested.
 
     The result is a dated version in the database. Captures that name it (format version
     2, key `calibration`) use its newest version when they are ingested. Earlier
@@ -151,7 +151,9 @@ def _rig_lines(record: Record, report: dict[str, Any]) -> list[str]:
         f"  spread of the lights in a held-out take: {report['spread']:.1%} "
         f"without and {report['spread_left']:.1%} with the gains of the others (medians)",
         f"  gains are known to {report['largest_relative_error']:.2%} or better, relative "
-        "to each other",
+        "to each other"
+        if report["light_gains"]
+        else "  intensities are left as stated",
         "  residuals of a held-out take with the gains of the others: "
         f"{misfit['gains']:.0%} of those without; with their directions, too: "
         f"{misfit['gains and offsets']:.0%}",
@@ -167,6 +169,8 @@ def _rig_lines(record: Record, report: dict[str, Any]) -> list[str]:
         )
     elif report["cameras"] > 1:
         lines.append("  cameras are left as stated")
+    if report["lobes"]:
+        lines.append("  captures with few samples may share the lobes of these takes")
     if few := report["without_gain"]:
         lines.append(f"  gain 1, as fewer than three takes show them: {', '.join(few)}")
     return lines

@@ -24,7 +24,7 @@ from skindb.reflectance._lumitexel_kernels import (
     MIN_SAMPLES_LOBES,
 )
 from skindb.reflectance.joint import (
-    SHARED_REFLECTANCE,
+    LOBE_REFLECTANCE,
     UNKNOWN_GLOSS,
     Gloss,
     JointFit,
@@ -83,9 +83,9 @@ def refine_jointly(
     Dataset
         The variables of both functions, refined (see `skindb.reflectance.joint`); as
         given for surfels with fewer than three samples, whose parameters cannot be
-        distinguished, or whose fit has not converged. The surface is one lobe of a fixed
-        width from four samples on, whose strength is near that of the capture, and eight
-        lobes from twelve on; below four there is none, and the total error of R_d includes
+        distinguished, or whose fit has not converged. The surface has lobes of a fixed
+        shape from four samples on, whose strength is near that of the capture, and eight
+        free ones from twelve on; below four there is none, and the total error of R_d includes
         all that the surface of skin reflects. R_d of
         captures with polarisers, measured behind crossed ones, is kept.
     """
@@ -148,7 +148,8 @@ def _total_diffuse(refined: JointFit, gloss: Gloss) -> Array:
     )
     if gloss.strength > 0:
         few = (samples >= MIN_SAMPLES_GLOSS) & (samples < MIN_SAMPLES_LOBES)
-        model = np.hypot(model, np.where(few, gloss.spread * SHARED_REFLECTANCE, 0.0))
+        surface = gloss.spread * (LOBE_REFLECTANCE @ gloss.lobes)
+        model = np.hypot(model, np.where(few, surface, 0.0))
     return np.hypot(refined.diffuse_shared, model)
 
 

@@ -44,7 +44,12 @@ REQUIRED = {
 }
 OPTIONAL = {
     "samples": (SHOT, *NOISE_SAMPLES),
-    "dome": (*NOISE_LIGHTS, *POLARISATION, variables.RELATIVE_REFLECTANCE),
+    "dome": (
+        *NOISE_LIGHTS,
+        *POLARISATION,
+        variables.RELATIVE_REFLECTANCE,
+        variables.RIG_LOBES_APPLIED,
+    ),
     "surfels": (variables.SCAN_NORMAL_ERROR,),
 }
 

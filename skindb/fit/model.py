@@ -37,6 +37,7 @@ from skindb.fit.translucency import fit_probe, summarise_translucency, transluce
 from skindb.jit import reported_compilation
 from skindb.parameters import FitParameters
 from skindb.reflectance.dictionary import Dictionary
+from skindb.reflectance.joint import UNKNOWN_GLOSS, Gloss
 from skindb.reflectance.kinds import surface_model
 from skindb.reflectance.model import ReflectanceModel
 from skindb.schema import FitStatus, Use, dataset, label, names_of
@@ -136,12 +137,17 @@ def first_pass(
         groups["light_gains"] = gains
         samples = divided_by_gains(samples, gains["light_gain"])
     with timer.stage("first pass"):
-        fitted = _fit_surfels(fitted_part(samples, held_out), surface, parameters)
+        part = fitted_part(samples, held_out)
+        gloss = estimate_gloss(part, eta=parameters.eta, scan_error=scan_error(part))
+        if gloss.lobes != UNKNOWN_GLOSS.lobes:
+            reasons = reasons | {"gloss": "of the calibration, where samples are few"}
+        fitted = _fit_surfels(part, surface, parameters, gloss)
     if parameters.inter_reflection:
         with timer.stage("inter-reflection"):
             direct = _direct_light(capture, samples, fitted, parameters.eta)
         with timer.stage("first pass again"):
-            fitted = _fit_surfels(fitted_part(direct, held_out), surface, parameters)
+            part = fitted_part(direct, held_out)
+            fitted = _fit_surfels(part, surface, parameters, gloss)
     total = fitted["diffuse_reflectance_total_error"]
     total[:] = np.hypot(total.values, np.nan_to_num(error_of_misfit(fitted)))
     fitted["fit_status"][find_obstructed(fitted)] = FitStatus.OBSTRUCTED
@@ -180,7 +186,10 @@ def _training_gains(
 
 
 def _fit_surfels(
-    samples: xr.Dataset, surface: ReflectanceModel, parameters: FitParameters
+    samples: xr.Dataset,
+    surface: ReflectanceModel,
+    parameters: FitParameters,
+    gloss: Gloss,
 ) -> xr.Dataset:
     """Normal, diffuse reflectance and surface term of every surfel; one graph, in which
     every block of samples is read once.
@@ -195,7 +204,7 @@ def _fit_surfels(
             samples.merge(estimates),
             eta=eta,
             scan_error=prior,
-            gloss=estimate_gloss(samples, eta=eta, scan_error=prior),
+            gloss=gloss,
         )
     )
     terms = fit_surface(

@@ -114,6 +114,8 @@ def dome_group(dome: DomeRecord, intensity: Float64) -> xr.Dataset:
         variables["light_offset_applied"] = [light.offset for light in lights]
     if any(set(camera.gain) != {1.0} for camera in cameras):
         variables["camera_gain_applied"] = [camera.gain for camera in cameras]
+    if dome.lobes:
+        variables["lobe_strength_applied"] = dome.lobes
     by_light = [light.polarisation for light in lights]
     by_camera = [camera.polarisation for camera in cameras]
     if any(by_light) and any(by_camera):

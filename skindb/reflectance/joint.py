@@ -1,12 +1,12 @@
 """Joint fit of the normal, R_d and the surface to the samples of surfels.
 
 A sample is cos(theta_i) (F_t F_t R_d / pi + sum_j x_j b_j) with R_d >= 0 of three channels
-and strengths x_j >= 0 of GGX lobes b_j of graded widths; surfels with few samples have one
-lobe, or none. Given the normal this is a non-negative least-squares problem; the normal is
-refined with all other parameters by Gauss-Newton steps. Weights are those of a comparison
-of cube roots, less for noisy samples and for outliers (Tukey's function). A surfel has no
-lobes narrower than 2/3 of the smallest angle at which it was seen from its normal to a half
-vector: their peaks would be extrapolated.
+and strengths x_j >= 0 of GGX lobes b_j of graded widths; surfels with few samples share the
+shape of these lobes, or have none. Given the normal this is a non-negative least-squares
+problem; the normal is refined with all other parameters by Gauss-Newton steps. Weights are
+those of a comparison of cube roots, less for noisy samples and for outliers (Tukey's
+function). A surfel has no lobes narrower than 2/3 of the smallest angle at which it was
+seen from its normal to a half vector: their peaks would be extrapolated.
 """
 
 from __future__ import annotations
@@ -24,13 +24,15 @@ from skindb.types import Array
 
 __all__ = ["UNKNOWN_GLOSS", "Gloss", "JointFit", "refine_block"]
 
-# Width of the one lobe of surfels with few samples: the best of three for eight faces of
-# Extended Yale B under 4 to 12 lights; the next narrower one would be better by a twentieth
-# for the cat of DiLiGenT.
-SHARED_WIDTH = 1
-SHARED_LOBE = np.eye(LOBES, dtype=np.float32)[SHARED_WIDTH]
-# fraction of light along the normal that it reflects at strength 1, by `GGX.normal_reflectance`
-SHARED_REFLECTANCE = 0.0176
+# Strengths of the lobes of surfels with few samples, times one factor: one lobe, whose width
+# is the best of three for eight faces of Extended Yale B under 4 to 12 lights; the next
+# narrower one would be better by a twentieth for the cat of DiLiGenT.
+SHARED_LOBES = (0.0, 1.0, *[0.0] * (LOBES - 2))
+# fractions of light along the normal that lobes of strength 1 reflect, by
+# `GGX.normal_reflectance`
+LOBE_REFLECTANCE = np.array(
+    [0.0105, 0.0176, 0.0231, 0.0260, 0.0271, 0.0276, 0.0277, 0.0277]
+)
 # rad; larger errors of the scan's normals, or no scan
 MAX_SCAN_ERROR = np.radians(15.0)
 # Gauss-Newton steps in the normal, and their fraction. Beside a scan the given normals
@@ -44,13 +46,15 @@ STEPS_WITHOUT_SCAN = (4, 1.0)
 
 
 class Gloss(NamedTuple):
-    """Mean and standard deviation of the strength of the one lobe of surfels with few
-    samples, and the number of samples from which they have it.
+    """Mean and standard deviation of the factor of the lobes that surfels with few samples
+    share, the number of samples from which they have them, and the strengths (8,) of these
+    lobes at factor 1.
     """
 
     strength: float
     spread: float
     samples: int = MIN_SAMPLES_GLOSS
+    lobes: tuple[float, ...] = SHARED_LOBES
 
 
 # Without it the lobe explains all light of one in eight pixels of a face under six lights.
@@ -78,7 +82,7 @@ def refine_block(
     scan_error
         Standard error of the scan's normals about each axis [rad], of a prior.
     gloss
-        Prior of the lobe of surfels with fewer than twelve samples.
+        Prior of the lobes of surfels with fewer than twelve samples.
 
     Returns
     -------
@@ -100,8 +104,10 @@ def refine_block(
     )
     lobes = Lobes(
         np.asarray(GRADED_ROUGHNESS**2, np.float32),
-        SHARED_LOBE,
-        *gloss,
+        np.array(gloss.lobes, np.float32),
+        gloss.strength,
+        gloss.spread,
+        gloss.samples,
         SURFACE_INDEX,
         np.ascontiguousarray(scan_normal, np.float64),
         float(scan_error),

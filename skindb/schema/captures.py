@@ -174,6 +174,11 @@ CAMERA_GAIN_APPLIED = declare(
     "float64 dome/camera_gain_applied(camera, channel) [1]",
     "gain by a calibration from takes, by which the radiance was divided; 1 if absent",
 )
+RIG_LOBES_APPLIED = declare(
+    "float64 dome/lobe_strength_applied(lobe) [1]",
+    "strengths, by a calibration from takes, of the lobes of graded widths that surfels with "
+    "few samples may share; unknown if absent",
+)
 LIGHT_POLARISATION = declare(
     "float32 dome/light_polarisation(light) [1]",
     "degree of circular polarisation, 1 right-handed, -1 left-handed, 0 without "
@@ -322,6 +327,11 @@ RIG_CAMERA_SPREAD = declare(
 RIG_CAMERA_SPREAD_LEFT = declare(
     "float64 rig_calibration/rig_camera_spread_left() [1]",
     "the same after division by the common gains of the other takes",
+)
+RIG_LOBES = declare(
+    "float64 rig_calibration/rig_lobe_strength(lobe) [1]",
+    "strengths of the lobes of graded widths that the takes have in common, for surfels "
+    "with few samples; NaN for fewer than three takes with many",
 )
 RIG_MISFIT = declare(
     "float64 rig_calibration/rig_misfit(correction) [1]",

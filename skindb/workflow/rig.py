@@ -11,6 +11,8 @@ import xarray as xr
 from skindb.calibration.lights import is_same_rig, moved_lights
 from skindb.errors import input_error, require
 from skindb.fit.corrections import LightResiduals
+from skindb.fit.gloss import TakeGloss, common_lobes, take_gloss
+from skindb.fit.lumitexels import lumitexels
 from skindb.fit.rig import (
     MIN_TAKES,
     common_camera_gains,
@@ -35,8 +37,9 @@ def calibrate_rig(
     progress: Progress = silent,
 ) -> Record:
     """Estimate the errors of intensity and direction of the lights, and of the sensitivity
-    of the cameras, that all takes of a rig have in common, and commit them as the next
-    version of the calibration of that name.
+    of the cameras, that all takes of a rig have in common, and the lobes of the skin of
+    takes with many samples, and commit them as the next version of the calibration of
+    that name.
 
     A take that is ingested later without the name of a calibration, with the same lights,
     uses them. What the takes themselves were ingested with is taken into account.
@@ -64,8 +67,8 @@ def calibrate_rig(
     ------
     InputError
         If there are fewer than three takes, if they are not of one rig or not fitted, or
-        if the common gains do not predict a held-out take. Nothing is stored
-        then.
+        if the common gains do not predict a held-out take and fewer than three takes have
+        many samples. Nothing is stored then.
     """
     key = require_text(name, NAME.pattern, "name of a calibration")
     require_kind_of_calibration(db, key, rig=True)
@@ -80,6 +83,7 @@ def calibrate_rig(
     inputs = list[Record]()
     residuals = list[tuple[LightResiduals, dict[str, Float64]]]()
     cameras = list[xr.DataArray]()
+    gloss = list[TakeGloss | None]()
     positions = dict[str, Float64]()
     for number, (take, model) in enumerate(models.items()):
         progress("lights", number, len(models))
@@ -94,6 +98,9 @@ def calibrate_rig(
         own, camera_gains = take_residuals(capture, fitted, rng=rng)
         residuals.append((own, lights))
         cameras.append(camera_gains)
+        if "statistics" in db.consent(take):
+            eta = float(fitted["fitted"][variables.REFRACTIVE_INDEX])
+            gloss.append(take_gloss(lumitexels(capture), eta=eta))
         inputs += [record, model]
     names = [*positions]
     group = common_light_errors(
@@ -104,8 +111,8 @@ def calibrate_rig(
         lights=names,
         positions=np.array([*positions.values()]),
     )
-    group = group.merge(common_camera_gains(cameras))
-    _require_help(group)
+    group = group.merge(common_camera_gains(cameras)).merge(common_lobes(gloss))
+    group = _with_stated_lights_unless_helpful(group)
     progress("lights", len(models), len(models))
     provenance = {
         "command": "calibrate",
@@ -153,6 +160,8 @@ def describe_rig(db: Database, record: Record) -> dict[str, Any]:
                 strict=True,
             )
         ),
+        "light_gains": bool((rig[variables.RIG_LIGHT_GAIN] != 1).any()),
+        "lobes": rig[variables.RIG_LOBES].dropna("lobe").values.tolist(),
         "angle": float(np.degrees(np.sqrt(np.square(turns).sum(axis=1).mean()))),
         "largest_angle_error": float(rig[variables.RIG_LIGHT_ANGLE_ERROR].max()),
         "without_gain": [str(light) for light in few],
@@ -191,6 +200,7 @@ def _lights(record: Record, capture: xr.DataTree) -> dict[str, Float64]:
     is_from_setup = (
         record.provenance.get("calibrated_by")
         and variables.LIGHT_GAIN_APPLIED not in dome
+        and variables.RIG_LOBES_APPLIED not in dome
     )
     require(
         not is_from_setup,
@@ -226,8 +236,10 @@ def _require_rig(
     )
 
 
-def _require_help(group: xr.Dataset) -> None:
-    """Require that the common gains predict a held-out take."""
+def _with_stated_lights_unless_helpful(group: xr.Dataset) -> xr.Dataset:
+    """The calibration, in which lights stay as they are stated if the common gains do not
+    predict a held-out take. Without lobes either, this is an error.
+    """
     spread = float(group[variables.RIG_SPREAD])
     left = float(group[variables.RIG_SPREAD_LEFT])
     require(
@@ -237,10 +249,21 @@ def _require_help(group: xr.Dataset) -> None:
         "none",
         "fit takes with more samples",
     )
+    if left < spread:
+        return group
     require(
-        left < spread,
+        bool(np.isfinite(group[variables.RIG_LOBES]).all()),
         "calibration from takes",
         "common gains must lower the spread of the lights in a held-out take",
         f"{spread:.1%} without them and {left:.1%} with them",
         "nothing was stored: more takes may help, or the intensities are good as they are",
+    )
+    stated = {
+        variables.RIG_LIGHT_GAIN: 1.0,
+        variables.RIG_LIGHT_GAIN_ERROR: np.nan,
+        variables.RIG_LIGHT_OFFSET: 0.0,
+        variables.RIG_LIGHT_ANGLE_ERROR: np.nan,
+    }
+    return group.assign(
+        {name: xr.full_like(group[name], value) for name, value in stated.items()}
     )

@@ -20,17 +20,13 @@ from skindb.fit import (
     fit_surface,
     refine_jointly,
 )
+from skindb.fit.gloss import common_lobes, take_gloss
 from skindb.reflectance.ggx import GGX
-from skindb.reflectance.joint import (
-    SHARED_REFLECTANCE,
-    SHARED_WIDTH,
-    UNKNOWN_GLOSS,
-    Gloss,
-)
+from skindb.reflectance.joint import LOBE_REFLECTANCE, UNKNOWN_GLOSS, Gloss
 from skindb.reflectance.lobes import GRADED_ROUGHNESS, SURFACE_INDEX
 from skindb.reflectance.mixture import Mixture
 from skindb.render.scene import from_model
-from skindb.schema import FitStatus, dataset
+from skindb.schema import FitStatus, dataset, label
 
 ETA = 1.0  # without a smooth boundary Lambert's law is exact
 FAR_MM = 1e6
@@ -182,6 +178,57 @@ def test_estimate_gloss__is_unknown_for_many_or_too_few_samples():
         assert prior == UNKNOWN_GLOSS
 
 
+def _rig_lobes(*, gloss):
+    """Lobes that three takes of other surfels under 24 lights have in common."""
+    takes = [
+        _planted(_lights(24), gloss=gloss, noise=0.01, seed=s)[0] for s in (7, 8, 9)
+    ]
+    no_scan = label("scan_normal_error", 60.0)
+    takes = [take.assign(scan_normal_error=no_scan) for take in takes]
+    known = [take_gloss(take, eta=ETA) for take in takes]
+    assert np.isnan(common_lobes([*known[:2], None])["rig_lobe_strength"]).all()
+    return common_lobes(known)["rig_lobe_strength"].values
+
+
+def _with_lobes(lumitexels, lobes):
+    return lumitexels.assign(
+        lobe_strength_applied=label("lobe_strength_applied", lobes)
+    )
+
+
+@pytest.mark.parametrize("count", [4, 8])
+def test_common_lobes__of_a_rig_help_captures_with_few_samples(count, small_dictionary):
+    """The planted lobe is narrower than the one that surfels share without a rig."""
+    lumitexels, normal = _planted(_lights(count), gloss=2 * STRENGTH, noise=0.01)
+    alone = _fitted(lumitexels, small_dictionary)
+    lobes = _rig_lobes(gloss=2 * STRENGTH)
+    helped = _fitted(_with_lobes(lumitexels, lobes), small_dictionary)
+    for name, error in (
+        ("diffuse_reflectance", lambda x: np.abs(x / R_D - 1)),
+        ("shading_normal", lambda x: _angle(x, normal)),
+    ):
+        before, after = (np.median(error(fit[name].values)) for fit in (alone, helped))
+        assert after < 0.5 * before
+    assert np.median(np.abs(helped["diffuse_reflectance"] / R_D - 1)) < 0.02
+
+
+@pytest.mark.parametrize("count", [4, 6, 8])
+def test_estimate_gloss__lobes_of_another_population_are_not_used(count):
+    for gloss, of_others in ((0.0, 2 * STRENGTH), (2 * STRENGTH, 0.0)):
+        lumitexels, _ = _planted(_lights(count), gloss=gloss, noise=0.01)
+        wrong = _with_lobes(lumitexels, _rig_lobes(gloss=of_others))
+        alone, tried = (
+            estimate_gloss(capture, eta=ETA, scan_error=60.0)
+            for capture in (lumitexels, wrong)
+        )
+        assert alone == tried
+
+
+def test_take_gloss__needs_sixteen_samples():
+    lumitexels, _ = _planted(_lights(15), gloss=STRENGTH)
+    assert take_gloss(lumitexels, eta=ETA) is None
+
+
 def test_refine_jointly__three_samples_have_no_gloss_whatever_the_prior():
     lumitexels, _ = _planted(_lights(3), gloss=STRENGTH)
     fitted = lumitexels.merge(estimate_normals(lumitexels, eta=ETA, scan_error=60.0))
@@ -194,10 +241,10 @@ def test_refine_jointly__three_samples_have_no_gloss_whatever_the_prior():
         np.testing.assert_array_equal(unknown[name], glossy[name])
 
 
-def test_shared_reflectance__is_that_of_the_lobe():
-    lobe = np.array([[1.0, GRADED_ROUGHNESS[SHARED_WIDTH]]])
-    reflectance = GGX(SURFACE_INDEX).normal_reflectance(lobe)
-    np.testing.assert_allclose(SHARED_REFLECTANCE, reflectance[0], rtol=1e-3)
+def test_lobe_reflectance__is_that_of_the_lobes():
+    lobes = np.stack([np.ones(len(GRADED_ROUGHNESS)), GRADED_ROUGHNESS], axis=1)
+    reflectance = GGX(SURFACE_INDEX).normal_reflectance(lobes)
+    np.testing.assert_allclose(LOBE_REFLECTANCE, reflectance, rtol=5e-3)
 
 
 @pytest.mark.parametrize("count", [3, 4, 6, 12])

@@ -53,6 +53,7 @@ ABSENT = (
     "light_gain_applied",
     "light_offset_applied",
     "camera_gain_applied",
+    "lobe_strength_applied",
 )
 
 

@@ -166,6 +166,41 @@ def test_ingest__lights_elsewhere_or_two_calibrations_leave_the_intensities(rig)
 
 
 @pytest.mark.slow
+def test_calibrate_rig__good_lights_stay_and_later_takes_know_the_lobes(tmp_path):
+    """Lights are where and as bright as they are stated, as in a rig that was calibrated
+    with a target: what its takes have in common is the skin.
+    """
+    rig = Rig(Database(tmp_path / "db"), tmp_path)
+    lights = directions(24)
+    for number in range(4):
+        name = f"S{number}"
+        # other lights are too bright in each session, so that none helps to predict another
+        bright = np.arange(len(lights)) % 3 == number % 3
+        gains = np.where(bright, 1.05, 1.0)
+        import_take(tmp_path, name, seed=number, gains=gains, lights=lights)
+        ingest(rig, name)
+        workflow.fit_take(rig.db, name)
+    workflow.record_consent(rig.db, "S3", ["fit"])
+    with pytest.raises(InputError, match="common gains must lower the spread"):
+        workflow.calibrate_rig(rig.db, ["S1", "S2", "S3"], name="dome")
+    names = ["S0", "S1", "S2"]
+    record = workflow.calibrate_rig(rig.db, names, name="dome")
+    report = workflow.describe_rig(rig.db, record)
+    assert not report["light_gains"]
+    assert report["angle"] == 0
+    assert len(report["lobes"]) == 8
+    before = lights_of(rig, "S0")
+    assert ingest(rig, "S0").provenance["calibrated_by"]["take"] == "dome"
+    capture = rig.db.read("capture", "S0")["dome"].to_dataset()
+    np.testing.assert_array_equal(capture["lobe_strength_applied"], report["lobes"])
+    np.testing.assert_array_equal(lights_of(rig, "S0"), before)
+    workflow.fit_take(rig.db, "S0")
+    # a take with these lobes contributes again
+    assert workflow.calibrate_rig(rig.db, names, name="dome").generation == 2
+    assert rig.db.verify() == []
+
+
+@pytest.mark.slow
 def test_calibrate_rig__takes_that_used_the_gains_do_not_count_twice(rig):
     workflow.calibrate_rig(rig.db, name="dome")
     first = gains_of(rig)
