@@ -64,4 +64,6 @@ MAX_WAIT_S = 7 * 24 * 3600.0
 MAX_SEED = 2**63 - 1
 MAX_PERMUTATIONS = 1_000_000
 MAX_PHOTOGRAPHS = 64  # that an ingest keeps
+# of a surface that is estimated from pictures; the equations of more take minutes
+MAX_RELIEF_POINTS = 250_000
 MAX_SPACING_MM = 1_000.0

@@ -25,6 +25,7 @@ from skindb.limits import (
     MAX_PERMUTATIONS,
     MAX_PHOTOGRAPHS,
     MAX_PLACEMENTS,
+    MAX_RELIEF_POINTS,
     MAX_SEED,
     MAX_SPACING_MM,
     MAX_VIRTUAL_PIXELS,
@@ -402,8 +403,17 @@ class QuickParameters(PictureParameters):
     ----------
     eta
         Refractive index of the subject.
+    points
+        Largest number of points of the maps and the page.
     """
 
+    points: int = option(
+        60_000,
+        "Largest number of points of the maps and the page; with more, the fit takes "
+        "longer, and browsers turn the page slowly.",
+        minimum=1_000,
+        maximum=MAX_RELIEF_POINTS,
+    )
     eta: float = option(
         1.3,
         "Refractive index of the subject: 1.3 of skin; 1 of matt things without a smooth "

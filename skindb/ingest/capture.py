@@ -62,7 +62,7 @@ from skindb.ingest.refinement import (
     reason_to_skip,
     refine_cameras,
 )
-from skindb.ingest.relief import MAX_POINTS, NO_SCAN_DEGREES, Relief, estimate_relief
+from skindb.ingest.relief import NO_SCAN_DEGREES, Relief, estimate_relief
 from skindb.ingest.report import (
     capture_provenance,
     describe_samples,
@@ -78,6 +78,7 @@ from skindb.ingest.surfels import (
     light_visibility,
     site_positions,
 )
+from skindb.limits import MAX_RELIEF_POINTS
 from skindb.parameters import IngestParameters
 from skindb.types import Float64, Half, Progress, silent
 
@@ -246,7 +247,7 @@ class _Run:
         if self.relief is not None and spacing > 1.5 * self.parameters.spacing_mm:
             notes.append(
                 f"the surface that the photographs show has points {spacing:.2g} mm apart; "
-                f"it is limited to the pixels, and to {MAX_POINTS:,} points"
+                f"it is limited to the pixels, and to {MAX_RELIEF_POINTS:,} points"
             )
         count = len(self.surfels.position)
         summary = self.summary | {

@@ -20,11 +20,11 @@ from skindb.errors import attempt_all, require
 from skindb.format.dome import CameraRecord, DomeRecord, LightRecord
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.geometry.scan import Scan
+from skindb.limits import MAX_RELIEF_POINTS
 from skindb.types import Float32, Float64, Half, Index, Mask, dots, finite_rows
 
 # error of the normals for which their prior has no effect [degree]
 NO_SCAN_DEGREES = 60.0
-MAX_POINTS = 250_000  # of the grid; the equations of more take minutes
 POINTS_PER_BLOCK = 1 << 14  # whose directions to all lights are in memory: 60 MB
 MIN_LIGHTS = 3
 # of the brightest lights of a pixel; darker ones are in a shadow or graze the surface
@@ -165,7 +165,7 @@ def _grey_pictures(
     camera = merger.camera
     area = camera.width * camera.height
     wanted = spacing_mm / camera.pixel_width(np.zeros(3))
-    step = max(round(wanted), int(np.ceil(np.sqrt(area / MAX_POINTS))), 1)
+    step = max(round(wanted), int(np.ceil(np.sqrt(area / MAX_RELIEF_POINTS))), 1)
     step = min(step, camera.width // 2 or 1, camera.height // 2 or 1)
     rows, columns = camera.height // step, camera.width // step
 

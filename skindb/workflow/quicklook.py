@@ -33,8 +33,6 @@ from skindb.workflow.pictures import view_takes
 
 PREFIX = "skindb-quick-"  # of temporary folders
 PROCESS = "process.json"
-# of the grid; more make a page that browsers turn slowly
-MAX_POINTS = 60_000
 # sRGB of the brightest hundredth of the albedo, which is relative
 BRIGHT = 0.9
 PAGE = "page.html"
@@ -62,7 +60,7 @@ def quick(
         gloss the part of the surface; both are relative.
         It must not hold these files.
     **parameters
-        Of `skindb.parameters.QuickParameters`: eta, and those of `import_images`.
+        Of `skindb.parameters.QuickParameters`: eta, points, and those of `import_images`.
 
     Returns
     -------
@@ -94,6 +92,7 @@ def quick(
     )
     known = asdict(QuickParameters(**parameters))
     fit = FitParameters(eta=known.pop("eta"))
+    points = known.pop("points")
     consent = {"scope": ["fit", "export"], "reference": "quick, nothing is stored"}
     _remove_left()
     with (
@@ -114,7 +113,7 @@ def quick(
         (camera,) = read_json(capture / "dome/dome.json", [])["cameras"]
         pixel = camera["t"][2] / camera["K"][0][0]
         area = camera["width"] * camera["height"]
-        step = max(int(np.ceil(np.sqrt(area / MAX_POINTS))), 1)
+        step = max(int(np.ceil(np.sqrt(area / points))), 1)
         db = Database(Path(folder) / "db")
         record = ingest_take(db, capture, spacing_mm=step * pixel, progress=progress)
         fit_take(db, record.take, fit, progress=progress)
@@ -123,6 +122,10 @@ def quick(
         model = db.read("model", record.take)
         result = _write_maps(model, out, step)
     notes = [*imported.notes, *record.provenance["summary"]["notes"], RELATIVE]
+    if step > 1:
+        notes.append(
+            f"maps have a pixel for {step} x {step} of the pictures; --points makes them finer"
+        )
     return {"files": [str(out / name) for name in names], "notes": notes} | result
 
 

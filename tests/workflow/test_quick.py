@@ -86,6 +86,14 @@ def test_three_lights_are_enough(tmp_path: Path) -> None:
     assert "lambert 100.0%" in result.stdout
 
 
+def test_quick_says_how_coarse_its_maps_are(pictures: Path, tmp_path: Path) -> None:
+    result = run("quick", pictures, tmp_path / "out", "--no-progress", "--points", 1000)
+    assert "maps have a pixel for 2 x 2 of the pictures" in result.stderr
+    assert read_exr(tmp_path / "out/normals.exr")[0].shape == (24, 24, 3)
+    fine = run("quick", pictures, tmp_path / "fine", "--no-progress")
+    assert "maps have a pixel" not in fine.stderr
+
+
 def test_quick_names_the_pictures_of_the_user(pictures: Path, tmp_path: Path) -> None:
     write_pictures(pictures, LIGHTS, albedo=(0.0, 0.0, 0.0))
     result = run("quick", pictures, tmp_path / "out", "--no-progress")
