@@ -30,6 +30,7 @@ from skindb.types import AnyArray, Array, Faces, Float32, Half, float64, lengths
 COUNT = 256  # lights, in 64 passes of four
 SKY_ROWS = 32  # rows of the image of the default sky
 GROUND = 0.2  # radiance below the horizon, relative to that of the zenith
+MAX_STILL_SIDE = 640  # px; a picture of a camera of 4 megapixels took 6 GB and minutes
 STILL_SAMPLES = 16  # rays per pixel of the picture that is shown without WebGL
 MIN_ALBEDO = 1e-4  # below it, ratios of albedos are meaningless
 MEASURED = (  # differences from skindb render (docs/howto/view.md)
@@ -268,11 +269,11 @@ def _surface(
 
 def still_picture(model: xr.DataTree) -> str:
     """Picture under all lights of the dome as a data URL, for browsers without WebGL."""
-    seen = render(model, samples=STILL_SAMPLES)
     dome = model["dome"].to_dataset().load()
-    gain = fixed_exposure(
-        Lighting(chosen_lights(dome, ())[0]), chosen_camera(dome, None)[0]
-    )
+    camera = chosen_camera(dome, None)[0]
+    scale = min(1.0, MAX_STILL_SIDE / max(camera.width, camera.height))
+    seen = render(model, samples=STILL_SAMPLES, scale=scale)
+    gain = fixed_exposure(Lighting(chosen_lights(dome, ())[0]), camera)
     png = imagecodecs.png_encode(tone_map(seen["radiance"].values, exposure=gain))
     return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
 

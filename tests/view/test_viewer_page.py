@@ -67,6 +67,14 @@ def page_file(model, tmp_path_factory):
     return path
 
 
+def test_still_picture__of_a_large_camera_is_small(model, monkeypatch):
+    monkeypatch.setattr("skindb.view.face.MAX_STILL_SIDE", 64)
+    _, _, content = still_picture(model).partition("base64,")
+    picture = imagecodecs.png_decode(base64.b64decode(content))
+    assert max(picture.shape[:2]) == 64
+    assert picture.max() > 50
+
+
 # small: every pixel is computed on the CPU
 def pixels(page):
     """Linear values (h, w, 3) of the canvas."""
