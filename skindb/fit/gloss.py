@@ -56,6 +56,7 @@ MAX_DEVICES = 64  # lights times cameras; surfels with few samples are rare unde
 SURFELS = 2000  # of which those with few samples are used, at most
 USED = 300
 MIN_SURFELS = 30  # with many samples
+MIN_FRONTAL = 0.2  # cosine of the angle at the face between a camera and a light
 MIN_TAKES_LOBES = 3
 # lights that stand for a capture with few samples, and factors of the mean lobes of a rig
 FEW_LIGHTS = 8
@@ -121,7 +122,8 @@ class TakeGloss(NamedTuple):
 
 
 def take_gloss(lumitexels: xr.Dataset, *, eta: float) -> TakeGloss | None:
-    """Gloss of a take; None if few surfels have 16 samples, or it has fewer lights.
+    """Gloss of a take; None if few surfels have 16 samples, or one camera fewer lights in
+    front.
 
     Parameters
     ----------
@@ -131,15 +133,19 @@ def take_gloss(lumitexels: xr.Dataset, *, eta: float) -> TakeGloss | None:
         As in `estimate_normals`.
     """
     part = _samples(lumitexels, SURFELS)
-    many = np.flatnonzero(_sample_count(part) >= MIN_SAMPLES_TRUSTED)
-    if len(many) < MIN_SURFELS or part.sizes["light"] < MIN_SAMPLES_TRUSTED:
+    part = part.isel(surfel=_sample_count(part) >= MIN_SAMPLES_TRUSTED)
+    if part.sizes["surfel"] < MIN_SURFELS:
         return None
-    part = part.isel(surfel=many[_spread(len(many), USED)])
+    part = part.isel(surfel=_spread(part.sizes["surfel"], USED))
     prior = scan_error(lumitexels)
     refined = _refined(_estimated(part, eta, prior), UNKNOWN_GLOSS, eta, prior)
     fitted = np.isfinite(refined.normal_error)
     by_camera = np.isfinite(part["reflectance_sample"].values).sum(axis=(0, 1, 3))
     part = part.isel(camera=[int(by_camera.argmax())])
+    light, view = _directions_from_middle(part)
+    part = part.isel(light=light @ view > MIN_FRONTAL)
+    if fitted.sum() < MIN_SURFELS or part.sizes["light"] < MIN_SAMPLES_TRUSTED:
+        return None
     return TakeGloss(refined.strength[fitted].mean(axis=0), part, eta, prior)
 
 
@@ -166,16 +172,22 @@ def common_lobes(takes: Sequence[TakeGloss | None]) -> xr.Dataset:
 def _few_lights_error(take: TakeGloss, lobes: Array) -> float:
     """Logarithm of the median relative error of all but eight spread lights, by these."""
     part = take.part
-    middle = part["surfel_position"].values.mean(axis=0)
-    light = unit(part["light_position"].values - middle)
-    view = unit(part["camera_position"].values[0] - middle)
+    light, view = _directions_from_middle(part)
     chosen = [int((light @ view).argmax())]
     while len(chosen) < FEW_LIGHTS:
         chosen.append(int((light @ light[chosen].T).max(axis=1).argmin()))
     few = _estimated(part.isel(light=chosen), take.eta, take.scan_error)
     refined = _refined(few, _shared(lobes), take.eta, take.scan_error)
     others = np.setdiff1d(np.arange(len(light)), chosen)
-    return float(np.log(np.nanmedian(_errors(refined, part, others, take.eta))))
+    error = _errors(refined, part, others, take.eta)
+    return float(np.log(np.nanmedian(error))) if np.isfinite(error).any() else 0.0
+
+
+def _directions_from_middle(part: xr.Dataset) -> tuple[Array, Array]:
+    """Unit directions to the lights (light, 3) and to the first camera (3,)."""
+    middle = part["surfel_position"].values.mean(axis=0)
+    light = unit(part["light_position"].values - middle)
+    return light, unit(part["camera_position"].values[0] - middle)
 
 
 def _shared(lobes: Array) -> Gloss:
