@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 
 from skindb.fit.albedo import estimate_diffuse_reflectance
 from skindb.fit.corrections import (
+    MIN_GAIN_SPREAD,
     bounced_light,
     divided_by_gains,
     estimate_light_gains,
+    gain_spread,
     without_bounce,
 )
 from skindb.fit.lumitexels import directions, scan_error
@@ -41,9 +43,6 @@ PATCH = 256
 MAX_PATCHES = 20
 MAX_SURFELS_GAINS = 250
 HELD_OUT_FRACTION = 0.2
-# Standard deviation of gains that turned normals do not explain. Estimates for correct
-# lights have 0.2 to 1.0 % on six captures with known truth; planted 3 % are above it.
-MIN_GAIN_SPREAD = 0.02
 # Fraction of the error that a correction must remove at lights and at cameras, and by
 # more than one standard error: on six captures the wrong choice is 4 to 10 % worse,
 # the right one 3 to 5 % better.
@@ -128,11 +127,7 @@ class Trial:
         )["light_gain"]
         middle = few["surfel_position"].values.mean(axis=0, keepdims=True)
         towards = directions(middle, few["light_position"].values)[0]
-        linear = np.column_stack([np.ones(len(towards)), towards])
-        logs = np.log(gain.values)
-        rest = logs - linear @ np.linalg.lstsq(linear, logs, rcond=None)[0]
-        spread = np.sqrt(np.square(rest).sum() / (rest.size - linear.shape[1]))
-        return gain, float(spread)
+        return gain, gain_spread(np.log(gain.values), towards)
 
     def direct(self, few: xr.Dataset, fitted: xr.Dataset) -> xr.Dataset:
         """The samples without light from other parts of the face, whose R_d is taken to

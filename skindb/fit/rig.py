@@ -8,10 +8,12 @@ import numpy as np
 import xarray as xr
 
 from skindb.fit.corrections import (
+    MIN_GAIN_SPREAD,
     LightErrors,
     LightResiduals,
     aligned,
     estimate_camera_gains,
+    gain_spread,
     light_residuals,
 )
 from skindb.fit.lumitexels import lumitexels
@@ -71,9 +73,11 @@ def common_light_errors(
     Returns
     -------
     Dataset
-        Group "rig_calibration". The spreads are NaN if no light has three takes. Offsets
-        are those that were applied, or else 0, unless with new ones the other takes
-        predict a held-out take better than with gains alone.
+        Group "rig_calibration". The spreads are NaN if no light has three takes. Gains
+        are 1 unless they differ by more than the errors of the estimate, and those of
+        other takes lower the spread in a held-out take. Offsets are those that were
+        applied, or else 0, unless with new ones the other takes predict a held-out take
+        better than with gains alone.
     """
     none = LightErrors(np.ones(len(lights)), np.zeros(positions.shape))
     commons = [Common([take.errors(turned=x) for take in takes]) for x in (False, True)]
@@ -88,13 +92,20 @@ def common_light_errors(
     ]
     turned = misfit[1] < MAX_LEFT_BY_OFFSETS * misfit[0]
     common = commons[turned]
-    gains = commons[0].logs
     distance = np.linalg.norm(positions, axis=1)
+    logs = commons[0].logs
+    spread, spread_left = (
+        _median([gain_spread(row, positions / distance[:, None]) for row in rows])
+        for rows in (logs, logs - commons[0].others_logs)
+    )
+    gain, log_error = common.errors.gain, common.log_error
+    if not spread_left < spread or spread < MIN_GAIN_SPREAD:
+        gain, log_error = np.ones(len(lights)), np.full(len(lights), np.nan)
     return dataset(
         {
             variables.RIG_LIGHT_POSITION: positions,
-            variables.RIG_LIGHT_GAIN: common.errors.gain,
-            variables.RIG_LIGHT_GAIN_ERROR: common.errors.gain * common.log_error,
+            variables.RIG_LIGHT_GAIN: gain,
+            variables.RIG_LIGHT_GAIN_ERROR: gain * log_error,
             variables.RIG_LIGHT_OFFSET: common.errors.offset,
             variables.RIG_LIGHT_ANGLE_ERROR: np.where(
                 np.any(common.errors.offset != 0, axis=1),
@@ -102,8 +113,8 @@ def common_light_errors(
                 np.nan,
             ),
             variables.RIG_TAKES: common.takes,
-            variables.RIG_SPREAD: _median_spread(gains),
-            variables.RIG_SPREAD_LEFT: _median_spread(gains - commons[0].others_logs),
+            variables.RIG_SPREAD: spread,
+            variables.RIG_SPREAD_LEFT: spread_left,
             variables.RIG_MISFIT: misfit,
         },
         coords={
@@ -139,7 +150,10 @@ def common_camera_gains(takes: Sequence[xr.DataArray]) -> xr.Dataset:
         np.concatenate([getattr(common, name) for common in channels], axis=1)
         for name in ("logs", "others_logs")
     )
-    spread, left = _median_spread(logs), _median_spread(logs - others)
+    spread, left = (
+        _median([np.nanstd(row) for row in rows if np.isfinite(row).any()])
+        for rows in (logs, logs - others)
+    )
     gain, log_error = (
         np.stack(columns, axis=1)
         for columns in zip(
@@ -208,7 +222,7 @@ def _medians(values: Array) -> tuple[Array, Array, Array]:
     return np.nanmedian(values, axis=0), others, error
 
 
-def _median_spread(logs: Array) -> float:
-    """Median over the takes of the standard deviation over the lights (take, light)."""
-    rows = logs[np.isfinite(logs).sum(axis=1) > 1]
-    return float(np.median(np.nanstd(rows, axis=1))) if len(rows) else np.nan
+def _median(spreads: Sequence[float]) -> float:
+    """Median over the takes that have a spread."""
+    known = [spread for spread in spreads if np.isfinite(spread)]
+    return float(np.median(known)) if known else np.nan

@@ -280,12 +280,11 @@ RIG_LIGHT_POSITION = declare(
 RIG_LIGHT_GAIN = declare(
     "float64 rig_calibration/rig_light_gain(light) [1]",
     "true over stated intensity, median over the takes; 1 for lights of fewer than "
-    "three takes",
+    "three takes, or if they do not differ by more than the errors of the estimate",
 )
 RIG_LIGHT_GAIN_ERROR = declare(
     "float64 rig_calibration/rig_light_gain_error(light) [1]",
-    "its standard error by the scatter of the takes; NaN for lights of fewer than three "
-    "takes",
+    "its standard error by the scatter of the takes; NaN where the gain was not estimated",
 )
 RIG_LIGHT_OFFSET = declare(
     "float64 rig_calibration/rig_light_offset(light, xyz) [mm]",
@@ -302,8 +301,8 @@ RIG_TAKES = declare(
 )
 RIG_SPREAD = declare(
     "float64 rig_calibration/rig_spread() [1]",
-    "standard deviation over the lights of the logarithms of the gains of a take; median "
-    "of the takes",
+    "standard deviation over the lights of the logarithms of the gains of a take, without "
+    "what is linear over the dome; median of the takes",
 )
 RIG_SPREAD_LEFT = declare(
     "float64 rig_calibration/rig_spread_left() [1]",

@@ -10,7 +10,7 @@ import xarray as xr
 
 from skindb.calibration.lights import is_same_rig, moved_lights
 from skindb.errors import input_error, require
-from skindb.fit.corrections import LightResiduals
+from skindb.fit.corrections import MIN_GAIN_SPREAD, LightResiduals
 from skindb.fit.gloss import TakeGloss, common_lobes, take_gloss
 from skindb.fit.lumitexels import lumitexels
 from skindb.fit.rig import (
@@ -112,7 +112,7 @@ def calibrate_rig(
         positions=np.array([*positions.values()]),
     )
     group = group.merge(common_camera_gains(cameras)).merge(common_lobes(gloss))
-    group = _with_stated_lights_unless_helpful(group)
+    _require_help(group)
     progress("lights", len(models), len(models))
     provenance = {
         "command": "calibrate",
@@ -146,6 +146,7 @@ def describe_rig(db: Database, record: Record) -> dict[str, Any]:
     return {
         "lights": rig.sizes["light"],
         "takes": record.provenance["parameters"]["takes"],
+        "light_gains": bool((rig[variables.RIG_LIGHT_GAIN] != 1).any()),
         "largest_relative_error": float(rig[variables.RIG_LIGHT_GAIN_ERROR].max()),
         "spread": float(rig[variables.RIG_SPREAD]),
         "spread_left": float(rig[variables.RIG_SPREAD_LEFT]),
@@ -160,7 +161,6 @@ def describe_rig(db: Database, record: Record) -> dict[str, Any]:
                 strict=True,
             )
         ),
-        "light_gains": bool((rig[variables.RIG_LIGHT_GAIN] != 1).any()),
         "lobes": rig[variables.RIG_LOBES].dropna("lobe").values.tolist(),
         "angle": float(np.degrees(np.sqrt(np.square(turns).sum(axis=1).mean()))),
         "largest_angle_error": float(rig[variables.RIG_LIGHT_ANGLE_ERROR].max()),
@@ -236,10 +236,15 @@ def _require_rig(
     )
 
 
-def _with_stated_lights_unless_helpful(group: xr.Dataset) -> xr.Dataset:
-    """The calibration, in which lights stay as they are stated if the common gains do not
-    predict a held-out take. Without lobes either, this is an error.
-    """
+def _require_help(group: xr.Dataset) -> None:
+    """Require lights or cameras that are not as stated, or lobes."""
+    if (
+        (group[variables.RIG_LIGHT_GAIN] != 1).any()
+        or (group[variables.RIG_LIGHT_OFFSET] != 0).any()
+        or (group[variables.RIG_CAMERA_GAIN] != 1).any()
+        or np.isfinite(group[variables.RIG_LOBES]).all()
+    ):
+        return
     spread = float(group[variables.RIG_SPREAD])
     left = float(group[variables.RIG_SPREAD_LEFT])
     require(
@@ -249,21 +254,17 @@ def _with_stated_lights_unless_helpful(group: xr.Dataset) -> xr.Dataset:
         "none",
         "fit takes with more samples",
     )
-    if left < spread:
-        return group
     require(
-        bool(np.isfinite(group[variables.RIG_LOBES]).all()),
+        left < spread,
         "calibration from takes",
         "common gains must lower the spread of the lights in a held-out take",
         f"{spread:.1%} without them and {left:.1%} with them",
         "nothing was stored: more takes may help, or the intensities are good as they are",
     )
-    stated = {
-        variables.RIG_LIGHT_GAIN: 1.0,
-        variables.RIG_LIGHT_GAIN_ERROR: np.nan,
-        variables.RIG_LIGHT_OFFSET: 0.0,
-        variables.RIG_LIGHT_ANGLE_ERROR: np.nan,
-    }
-    return group.assign(
-        {name: xr.full_like(group[name], value) for name, value in stated.items()}
+    raise input_error(
+        "calibration from takes",
+        f"the lights must differ by {MIN_GAIN_SPREAD:.0%}, which errors of the estimate "
+        "reach, without what is linear over the dome",
+        f"{spread:.1%}",
+        "nothing was stored: the intensities are good as they are",
     )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from skindb.fit import estimate_camera_gains, light_residuals
-from skindb.fit.corrections import LightErrors
+from skindb.fit.corrections import LightErrors, gain_spread
 from skindb.fit.rig import Common, common_camera_gains, common_light_errors
 from skindb.schema import label
 
@@ -61,6 +61,49 @@ def test_common__without_common_gains_the_others_make_it_worse():
     group = common(gains)
     left = group.logs - group.others_logs
     assert np.median(left.std(axis=1)) > np.median(group.logs.std(axis=1))
+
+
+def test_gain_spread__is_that_of_random_gains_without_what_is_linear_over_the_dome():
+    rng = np.random.default_rng(0)
+    towards = rng.standard_normal((500, 3))
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    random = rng.normal(0, 0.05, 500)
+    smooth = 0.3 + towards @ [0.1, -0.2, 0.4]
+    random[0] = np.nan
+    # 3 standard errors of 500 values
+    assert gain_spread(random + smooth, towards) == pytest.approx(0.05, rel=0.1)
+    assert gain_spread(smooth, towards) < 1e-12
+    few = gain_spread(np.array([0.0, 0.02, 0.04]), towards[:3])
+    assert few == pytest.approx(0.02)
+    assert np.isnan(gain_spread(np.array([np.nan, 1.0]), towards[:2]))
+
+
+def test_common_light_errors__right_lights_stay_although_the_estimates_are_alike(
+    new_skin,
+):
+    """Gains of 1 % that all takes have in common, as bounced light makes them, are not
+    those of lamps.
+    """
+    common = np.exp(0.01 * np.random.default_rng(4).standard_normal(30))
+    takes = []
+    for seed in range(3):
+        skin = new_skin(surfels=100, lights=30, cameras=4, noise=0.01, seed=seed)
+        sample = skin.lumitexels["reflectance_sample"].values.astype(np.float32)
+        samples = skin.lumitexels.assign(
+            surfel_normal=label("surfel_normal", skin.normal.astype(np.float32)),
+            reflectance_sample=label(
+                "reflectance_sample",
+                (sample * common[:, None, None]).astype(np.float16),
+            ),
+        )
+        takes.append(light_residuals(samples, rng=np.random.default_rng(0)))
+    names = [str(k) for k in range(30)]
+    position = skin.lumitexels["light_position"].values
+    group = common_light_errors(takes, lights=names, positions=position)
+    assert 0.005 < group["rig_spread"] < 0.02
+    assert group["rig_spread_left"] < 0.5 * group["rig_spread"]
+    assert (group["rig_light_gain"] == 1).all()
+    assert np.isnan(group["rig_light_gain_error"]).all()
 
 
 @pytest.mark.parametrize("degrees", [0.0, 1.0])

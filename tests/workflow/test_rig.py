@@ -5,6 +5,7 @@ later takes use them.
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import NamedTuple
@@ -370,7 +371,7 @@ def test_calibrate_command(rig):
 
     output = run("--from-takes", "--name", "dome")
     assert "dome: calibration 1 of 13 lights from 5 takes" in output
-    assert "spread of the lights in a held-out take: 7." in output
+    assert re.search(r"held-out take: [78]\.\d% without and [1-3]\.\d% with", output)
     assert "gains are known to" in output
     assert "residuals of a held-out take with the gains of the others: " in output
     # a matt sphere without the boundary of skin looks as if its lights were turned a little
