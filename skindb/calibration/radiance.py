@@ -34,12 +34,11 @@ Image = Float32
 
 @dataclass(frozen=True)
 class FrameMerger:
-    """Merges exposures of one camera to radiance, with its dark frames and vignette."""
+    """Merges exposures of one camera to radiance, with its dark frames."""
 
     camera: CameraRecord
     seconds: tuple[float, ...]
     dark: Frame | None = None  # (exposure, h, w, 3) mean dark frames
-    vignette: Image | None = None  # (h, w, 1)
 
     def merge(
         self,
@@ -87,8 +86,8 @@ class FrameMerger:
         slope = np.asarray([1 / np.float32(span)], np.float32)
         longest = max(self.seconds)
         shade = np.ones((1, 1))
-        if self.vignette is not None:
-            shade = self.vignette[..., 0].astype(float)
+        if self.camera.vignette.any():
+            shade = vignette_gain(self.camera)[..., 0].astype(float)
         colours = matrix if (matrix != np.eye(3)).any() else np.zeros((0, 3))
         return ExposureModel(
             dark=dark,
@@ -124,7 +123,7 @@ def _curve(sensor: SensorRecord, *, dark: bool) -> tuple[Image, int]:
 def frame_merger(
     dome: DomeRecord, camera: CameraRecord, digests: Digests | None = None
 ) -> FrameMerger:
-    """Read the dark frames of a camera and compute its vignette."""
+    """Read the dark frames of a camera."""
     kind = camera.sensor.kind
     dark = None
     if dome.dark and kind.bits:
@@ -133,8 +132,7 @@ def frame_merger(
             for exposure in dome.exposures
         ]
         dark = np.stack(read_frames(files, kind, digests))
-    gain = vignette_gain(camera) if kind.bits and camera.vignette.any() else None
-    return FrameMerger(camera, tuple(dome.exposures.values()), dark, gain)
+    return FrameMerger(camera, tuple(dome.exposures.values()), dark)
 
 
 def frame_mergers(

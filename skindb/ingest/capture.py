@@ -333,8 +333,9 @@ class _DomeStages:
             light_fraction = relief.light_fraction(
                 self.dome.cameras[0], surfels.position
             )
-        sees = partial(camera_visibility, surfels, scene=scene, pool=self.pool)
-        visible, clear, pixels = sees(self.dome.cameras)
+        sees = partial(camera_visibility, surfels, pool=self.pool)
+        visible, clear, pixels = sees(self.dome.cameras, scene=scene)
+        del scene  # 0.2 kB a surfel, which only rotated cameras need again
         if relief is not None:
             # every point was made from pixels that show it
             visible, clear = np.ones_like(visible), np.ones_like(clear)
@@ -353,7 +354,9 @@ class _DomeStages:
             self._require_cameras(rotations)
             if refined is not self.dome:
                 self.dome = refined
-                visible, clear, pixels = sees(refined.cameras)
+                scene = RayScene(surfels.position, surfels.faces)
+                visible, clear, pixels = sees(refined.cameras, scene=scene)
+                del scene
                 check = replace(check, dome=refined, clear=clear, pixels=pixels)
                 sampler = self._sampler(mergers, check)
             self.run.report("refine", 1, 1)

@@ -158,7 +158,13 @@ def test_frame_merger__divides_the_channels_by_the_gains_of_the_camera(kind):
     frame = np.full((2, 3, 3), 1000, np.uint16 if kind.bits else np.float32)
     plain, made = (
         FrameMerger(
-            SimpleNamespace(sensor=sensor, colour_matrix=np.eye(3), gain=gain), (1.0,)
+            SimpleNamespace(
+                sensor=sensor,
+                colour_matrix=np.eye(3),
+                vignette=np.zeros(3),
+                gain=gain,
+            ),
+            (1.0,),
         ).merge([frame])[0]
         for gain in ((1.0, 1.0, 1.0), gain)
     )
@@ -228,9 +234,7 @@ def test_frame_merger__develops_as_merge_exposures(pristine, with_dark, curved):
                 frames, seconds, sensor, dark=dark, vignette=gain
             )
             usable = np.zeros(want_flag.shape, np.uint8)
-            got, flag = FrameMerger(camera, seconds, dark, gain).merge(
-                frames, usable=usable
-            )
+            got, flag = FrameMerger(camera, seconds, dark).merge(frames, usable=usable)
             np.testing.assert_array_equal(flag, want_flag)
             if not with_dark:  # dark frames move the dark level of each pixel
                 np.testing.assert_array_equal(usable, usable_exposures(frames, sensor))
@@ -241,7 +245,7 @@ def test_frame_merger__develops_as_merge_exposures(pristine, with_dark, curved):
             scale = np.nanmax(np.abs(want))
             np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-8 * scale)
             coloured, _ = FrameMerger(
-                replace(camera, colour_matrix=matrix), seconds, dark, gain
+                replace(camera, colour_matrix=matrix), seconds, dark
             ).merge(frames)
             np.testing.assert_allclose(
                 coloured, want @ matrix.T, rtol=2e-6, atol=1e-7 * scale
@@ -263,9 +267,7 @@ def test_frame_merger__develops_spans_as_it_does_the_whole(pristine, lens):
     frames = [
         np.asarray(65536 * rng.random((21, 37, 3)) ** 3, np.uint16) for _ in range(2)
     ]
-    merger = FrameMerger(
-        camera, (0.1, 0.02), None, vignette_gain(camera) if lens else None
-    )
+    merger = FrameMerger(camera, (0.1, 0.02))
     spans = np.sort(rng.integers(0, 38, (21, 2)), axis=1)
     spans[3], spans[4], spans[5] = (0, 37), (37, 0), (7, 7)
     inside = (np.arange(37) >= spans[:, :1]) & (np.arange(37) < spans[:, 1:])
@@ -395,7 +397,10 @@ def test_frame_merger__counts_exposures_that_are_neither_dark_nor_saturated():
         for t in BRACKETS
     ]
     camera = SimpleNamespace(
-        sensor=quiet, colour_matrix=np.eye(3), gain=(1.0, 1.0, 1.0)
+        sensor=quiet,
+        colour_matrix=np.eye(3),
+        vignette=np.zeros(3),
+        gain=(1.0, 1.0, 1.0),
     )
     usable = np.zeros((1, 6), np.uint8)
     FrameMerger(camera, BRACKETS).merge(frames, usable=usable)
