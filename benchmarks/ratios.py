@@ -5,7 +5,7 @@
 
 Every row measures skindb and its peer one after the other on this machine, so that
 their ratio is meaningful although absolute times vary. `--page` replaces the table
-between the marks of a page, `--quick` takes less than a minute. The first run also
+between the marks of a page, `--quick` takes 70 s of CPU time. The first run also
 compiles.
 """
 

@@ -495,7 +495,8 @@ class SensorPatterns:
         for j, c in sorted(self.pairs.intersection(views) - self._added):
             camera = self._dome.cameras[c]
             self.add(j, c, read_view(self._dome, self._dome.lights[j].id, camera))
-        faults = pool.map(self._fault, sorted(self._total))
+        faults = list(pool.map(self._fault, sorted(self._total)))
+        self._total.clear()  # 3 MB a camera
         return [fault for fault in faults if fault is not None]
 
     def _fault(self, camera: str) -> Fault | None:

@@ -259,9 +259,7 @@ class Sampler:
             shot_noise=shot_noise(check.dome, check.intensity, check.surfels),
             photographs=self._kept(self.kept, _photograph_name),
             calibration=calibration,
-            noise=sample_noise(
-                check.dome, check.pixels, np.ascontiguousarray(pixels.T)
-            ),
+            noise=sample_noise(check.dome, check.pixels, pixels.T),
         )
 
     def _sample_view(self, j: int, c: int, *, picture: bool) -> None:
