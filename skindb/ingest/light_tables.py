@@ -130,7 +130,7 @@ def _table_light(words: Sequence[str], header: Sequence[str], place: str) -> Lig
     )
     gain = numbers([cells.get("intensity", "1")])[0]
     vector = np.array([np.nan if value is None else value for value in values])
-    usable = np.isfinite(vector).all() and np.linalg.norm(vector) > 0
+    usable = 0 < np.linalg.norm(vector) < np.inf
     require(
         bool(name) and bool(usable) and gain is not None and 0 < gain < np.inf,
         place,

@@ -52,6 +52,7 @@ MIN_MIXED = 100
 # 1.07 and at least 0.23; with wrong ones 0.98 have more, with mirrored ones 0.92.
 WRONG_AXES_RATIO = 1.15
 MIN_CONVEXITY = -0.1
+MIN_TILT = 0.2  # RMS sine of the normals to their mean; those subjects have 0.55 to 0.7
 # what the misfits of wrong axes are of
 WRONG_AXES = ("", "mirrored", "with x and y exchanged", "turned by 90 degrees")
 MIN_COSINE = 0.1  # to the camera; slopes beyond it are not measurable
@@ -317,8 +318,11 @@ def _wrong_axes(normal: Float64) -> str:
         return f"{WRONG_AXES[np.argmin(misfit)]}, as no surface has these normals"
     place = np.argwhere(np.isfinite(normal[..., 2]))[:, ::-1].astype(np.float64)
     place -= place.mean(axis=0)
-    slope = normal[np.isfinite(normal[..., 2]), :2]
-    outwards = (place * slope).sum() / np.sqrt((place**2).sum() * (slope**2).sum())
+    tilt = normal[np.isfinite(normal[..., 2]), :2]
+    tilt -= tilt.mean(axis=0)
+    if np.sqrt(2 * np.mean(tilt**2)) < MIN_TILT:
+        return ""  # flat things, such as coins, are hollow by noise
+    outwards = (place * tilt).sum() / np.sqrt((place**2).sum() * (tilt**2).sum())
     convexity = outwards + np.sign(ax + dy)[known].mean()
     if convexity < MIN_CONVEXITY:
         return "turned by 180 degrees, as the surface is hollow"

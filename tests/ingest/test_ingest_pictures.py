@@ -317,6 +317,7 @@ def test_tables_of_lights(tmp_path: Path, text: str, lights: int) -> None:
     [
         ("a.png,1,0,1\na.png,0,1,1\n", "twice"),
         ("a.png,0,0,0\n", "line 1"),
+        ("a.png,1e999,0,1\n", "line 1"),
         ("a.png,1,nan,0\n", "line 1"),
         ("picture,x,y,z\na.png,1,zero,1\n", "line 2"),
         ("a.png,x,y,z,intensity\nb.png,1,0,1,-1\n", "line 2"),
@@ -595,6 +596,21 @@ def test_wrong_axes_of_lights_are_noted(
     notes = " ".join(tree.attrs["summary"]["notes"])
     assert ("lights seem to be" in notes) == bool(note)
     assert note in notes
+
+
+def test_flat_surfaces_have_no_wrong_axes(tmp_path: Path) -> None:
+    names = write_pictures(tmp_path / "pictures", LIGHTS)
+    rng = np.random.default_rng(2)
+    for name, light in zip(names, LIGHTS, strict=True):
+        picture = 0.5 * light[2] + rng.normal(0, 0.005, (SIZE, SIZE, 3))
+        write_frame(
+            tmp_path / "pictures" / name, encoded(picture, "uint16", srgb=False)
+        )
+    write_table(tmp_path / "pictures/lights.csv", names, LIGHTS)
+    import_images(tmp_path / "pictures", tmp_path / "capture", PERSON)
+    tree = ingested(tmp_path / "capture", tmp_path)
+    notes = " ".join(tree.attrs["summary"]["notes"])
+    assert "lights seem to be" not in notes
 
 
 def noisy_capture(
