@@ -54,7 +54,7 @@ WRONG_AXES_RATIO = 1.15
 MIN_CONVEXITY = -0.1
 MIN_TILT = 0.2  # RMS sine of the normals to their mean; those subjects have 0.55 to 0.7
 # what the misfits of wrong axes are of
-WRONG_AXES = ("", "mirrored", "with x and y exchanged", "turned by 90 degrees")
+WRONG_AXES = ("", "mirrored", "exchanged in x and y", "turned by 90 degrees")
 MIN_COSINE = 0.1  # to the camera; slopes beyond it are not measurable
 # of neighbouring points: depth over width, from which the surface is torn apart
 MAX_SLOPE = 8.0
