@@ -159,6 +159,8 @@ def _unchanged(
     """The newest version of a capture if an ingest would make it again."""
     if not db.has("capture", capture.take):
         return None
+    if "fit" not in db.consent(capture.take):
+        return None  # the ingest refuses it
     record = db.record("capture", capture.take)
     stored = record.provenance
     if stored.get("code_digest") != code_digest(ingest_capture):

@@ -150,6 +150,11 @@ def test_a_capture_that_is_unchanged_is_not_stored_again(
     record = json.loads((capture / "capture.json").read_text())
     (capture / "capture.json").write_text(json.dumps(record | {"age": 30}))
     assert ingested(9) == (5, False)
+    assert ingested(9) == (5, True)
+    db.record_consent("P1", ["statistics"])
+    refused = run(*words, 9)
+    assert refused.returncode == 1
+    assert "needs the scope 'fit'" in refused.stderr
 
 
 @pytest.mark.parametrize(
