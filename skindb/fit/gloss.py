@@ -102,8 +102,8 @@ def estimate_gloss(
     errors = [_left_out_error(part, prior, eta, scan_error) for prior in priors]
     best = int(np.argmin(errors))
     best = best if errors[best] < (1 - MIN_GAIN) * errors[0] else 0
-    if variables.RIG_LOBES_APPLIED in lumitexels:
-        prior = _shared(lumitexels[variables.RIG_LOBES_APPLIED].values)
+    if variables.LOBE_STRENGTH_APPLIED in lumitexels:
+        prior = _shared(lumitexels[variables.LOBE_STRENGTH_APPLIED].values)
         error = _left_out_error(part, prior, eta, scan_error)
         if error < (1 - MIN_GAIN) * errors[best]:
             return prior
@@ -166,7 +166,7 @@ def common_lobes(takes: Sequence[TakeGloss | None]) -> xr.Dataset:
             [_few_lights_error(take, f * lobes) for f in FACTORS] for take in known
         ]
         lobes *= FACTORS[np.sum(errors, axis=0).argmin()]
-    return dataset({variables.RIG_LOBES: lobes})
+    return dataset({variables.RIG_LOBE_STRENGTH: lobes})
 
 
 def _few_lights_error(take: TakeGloss, lobes: Array) -> float:

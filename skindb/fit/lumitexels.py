@@ -48,7 +48,7 @@ OPTIONAL = {
         *NOISE_LIGHTS,
         *POLARISATION,
         variables.RELATIVE_REFLECTANCE,
-        variables.RIG_LOBES_APPLIED,
+        variables.LOBE_STRENGTH_APPLIED,
     ),
     "surfels": (variables.SCAN_NORMAL_ERROR,),
 }

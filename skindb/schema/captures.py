@@ -174,7 +174,7 @@ CAMERA_GAIN_APPLIED = declare(
     "float64 dome/camera_gain_applied(camera, channel) [1]",
     "gain by a calibration from takes, by which the radiance was divided; 1 if absent",
 )
-RIG_LOBES_APPLIED = declare(
+LOBE_STRENGTH_APPLIED = declare(
     "float64 dome/lobe_strength_applied(lobe) [1]",
     "strengths, by a calibration from takes, of the lobes of graded widths that surfels with "
     "few samples may share; unknown if absent",
@@ -327,7 +327,7 @@ RIG_CAMERA_SPREAD_LEFT = declare(
     "float64 rig_calibration/rig_camera_spread_left() [1]",
     "the same after division by the common gains of the other takes",
 )
-RIG_LOBES = declare(
+RIG_LOBE_STRENGTH = declare(
     "float64 rig_calibration/rig_lobe_strength(lobe) [1]",
     "strengths of the lobes of graded widths that the takes have in common, for surfels "
     "with few samples; NaN for fewer than three takes with many",

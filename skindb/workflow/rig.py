@@ -161,7 +161,7 @@ def describe_rig(db: Database, record: Record) -> dict[str, Any]:
                 strict=True,
             )
         ),
-        "lobes": rig[variables.RIG_LOBES].dropna("lobe").values.tolist(),
+        "lobes": rig[variables.RIG_LOBE_STRENGTH].dropna("lobe").values.tolist(),
         "angle": float(np.degrees(np.sqrt(np.square(turns).sum(axis=1).mean()))),
         "largest_angle_error": float(rig[variables.RIG_LIGHT_ANGLE_ERROR].max()),
         "without_gain": [str(light) for light in few],
@@ -200,7 +200,7 @@ def _lights(record: Record, capture: xr.DataTree) -> dict[str, Float64]:
     is_from_setup = (
         record.provenance.get("calibrated_by")
         and variables.LIGHT_GAIN_APPLIED not in dome
-        and variables.RIG_LOBES_APPLIED not in dome
+        and variables.LOBE_STRENGTH_APPLIED not in dome
     )
     require(
         not is_from_setup,
@@ -242,7 +242,7 @@ def _require_help(group: xr.Dataset) -> None:
         (group[variables.RIG_LIGHT_GAIN] != 1).any()
         or (group[variables.RIG_LIGHT_OFFSET] != 0).any()
         or (group[variables.RIG_CAMERA_GAIN] != 1).any()
-        or np.isfinite(group[variables.RIG_LOBES]).all()
+        or np.isfinite(group[variables.RIG_LOBE_STRENGTH]).all()
     ):
         return
     spread = float(group[variables.RIG_SPREAD])

@@ -24,7 +24,7 @@ from skindb.schema.declaration import DECLARED, declare
 
 DIMS = set(
     "surfel face light camera channel channel_2 site fibre dictionary parameter "
-    "measure v u component region xyz uv "
+    "measure lobe v u component region xyz uv "
     "corner landmark row col coefficient axis theta_h theta_d phi_d photograph image_row image_col "
     "group k take edge bin trait side level status samples space statistic "
     "contrast quantity attribute attribute_2 "
