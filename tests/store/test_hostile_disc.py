@@ -66,6 +66,7 @@ def _writing(place, captures, name):
             str(captures / "V001.lotion"),
             "--spacing",
             "6",
+            "--again",
             "--no-progress",
         ),
         ("fit", db, "V001.lotion", "--no-progress"),
