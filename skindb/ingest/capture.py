@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
+import gc
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -155,6 +157,10 @@ def ingest_capture(
         run.require_no_faults()
         tree = xr.DataTree.from_dict(run.groups)
         tree.attrs = run.attributes()
+        # what was freed, which the C library would keep while samples are written
+        gc.collect()
+        with suppress(AttributeError):  # of glibc
+            ctypes.CDLL(None).malloc_trim(0)
         stack.enter_context(
             dask.config.set(scheduler="threads", num_workers=threads(capture.dome))
         )
