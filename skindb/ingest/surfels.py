@@ -41,8 +41,7 @@ Half = NDArray[np.float16]
 VisibilityTest = Callable[[Index], Mask]  # surfels (m,) that face an eye -> (m,)
 # points of a light's disc besides its centre; each stands for a fifth of its area
 RING_POINTS = 4
-# in Morton order, a patch of four by four, of which one is tested: a shadow or penumbra that
-# touches none of these is not found
+# one surfel in this many is tested for all points of a disc, to find isolated penumbrae
 SURFELS_PER_PROBE = 16
 EDGE_PX = 1.5  # pixels within this distance may contribute to a sample
 STRIP_ROWS = 32  # rows of a depth map at a time
@@ -252,8 +251,8 @@ def light_visibility(
     """Visible fraction (n, light) of the lights' discs; 0 where the surfel faces away
     from the centre.
 
-    One surfel of each block is tested first. All surfels are tested where blocks differ,
-    and from there on as long as a test changes what was assumed.
+    All points of a disc are tested only where their visibility may differ: at the edge
+    of the shadow of the centre, and from there on as long as a penumbra is found.
     """
 
     def visible_fraction(light: LightRecord) -> Half:
@@ -261,13 +260,13 @@ def light_visibility(
         way = light.position - surfels.position
         facing = dots(way, surfels.normal) > 0
         indices = np.flatnonzero(facing)
-        probes = indices[::SURFELS_PER_PROBE]
-        tests = [partial(_visible, surfels, scene, p) for p in disc_points(light)]
-        assumed = np.repeat(tests[0](probes), SURFELS_PER_PROBE)
-        fraction[indices] = assumed[: len(indices)]
-        start = mixed(surfels.faces, fraction > 0)
-        start[probes] = True
-        _test_surfels(fraction, start & facing, surfels.faces, facing, tests)
+        centre, *ring = disc_points(light)
+        fraction[indices] = _visible(surfels, scene, centre, indices)
+        if ring:
+            start = mixed(surfels.faces, fraction > 0)
+            start[::SURFELS_PER_PROBE] = True
+            tests = [partial(_visible, surfels, scene, point) for point in ring]
+            _add_penumbrae(fraction, start & facing, surfels.faces, facing, tests)
         return fraction
 
     # used column by column
@@ -277,27 +276,27 @@ def light_visibility(
     return out
 
 
-def _test_surfels(
+def _add_penumbrae(
     fraction: Half,
     start: Mask,
     faces: Index,
     facing: Mask,
-    tests: Sequence[VisibilityTest],
+    ring: Sequence[VisibilityTest],
 ) -> None:
-    """Replace the assumed visibility `fraction` (n,), 0 or 1, by that of the points of a
-    disc, beginning at `start` (n,).
+    """Refine `fraction` (n,), the visibility of a disc's centre, to that of the disc,
+    beginning at `start` (n,).
 
-    The neighbours of every surfel that differs from what was assumed, such as those in a
-    penumbra, are also tested.
+    The neighbours of every surfel in a penumbra are also tested, until no further
+    surfel is in a penumbra.
     """
     untested = facing & ~start
     front = np.flatnonzero(start)
     while len(front):
-        visible = np.mean([sees(front) for sees in tests], axis=0)
-        changed = np.zeros(len(fraction), bool)
-        changed[front[visible != fraction[front]]] = True
-        fraction[front] = visible
-        ring_surfels = grown(faces, changed) & untested
+        total = fraction[front] + np.sum([sees(front) for sees in ring], axis=0)
+        fraction[front] = total / (RING_POINTS + 1)
+        soft = np.zeros(len(fraction), bool)
+        soft[front[(total > 0) & (total < RING_POINTS + 1)]] = True
+        ring_surfels = grown(faces, soft) & untested
         untested &= ~ring_surfels
         front = np.flatnonzero(ring_surfels)
 
