@@ -16,6 +16,7 @@ nothing but what `clean` lists. The program ends with 1 if that fails once.
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import os
 import shutil
@@ -108,6 +109,7 @@ WORK = {"fit": fit, "refit": fit, "ingest": ingest}
 
 
 def _telling(call, stage: str, tell: Tell):
+    @functools.wraps(call)  # whose code is recorded
     def called(*args, **options):
         tell(stage)
         return call(*args, **options)
