@@ -66,7 +66,8 @@ class FrameMerger:
         if self.camera.sensor.kind.bits == 0:
             develop_linear(sample_bits(_only(frames)), spans, radiance, flag)
             if set(self.camera.gain) != {1.0}:
-                radiance /= np.array(self.camera.gain, np.float32)
+                with np.errstate(all="ignore"):  # outside the spans is any value
+                    radiance /= np.array(self.camera.gain, np.float32)
             if usable is not None:
                 usable[:] = 2
             return radiance, flag
@@ -345,7 +346,8 @@ def radiance_noise(
     seconds^2 / (photons + read noise). A straight line, fitted with relative errors, is
     exact for one exposure, and accurate to 3 % for two exposures with a ratio of eight
     (5 % for eight exposures). A nonlinear response is replaced by its mean slope, and
-    the colour matrix is applied to grey light.
+    the colour matrix is applied to grey light. Radiance is divided by the gains of the
+    camera.
 
     Parameters
     ----------
@@ -366,8 +368,13 @@ def radiance_noise(
         for longest in range(len(time))
     ]
     mixed = np.square(camera.colour_matrix).sum(axis=1)[:, None]
+    sensitivity = np.array(camera.gain)[:, None]
     offset, slope = np.array(lines).T
-    return np.tile(1 / (time * gain), (3, 1)), mixed * offset, mixed * slope
+    return (
+        1 / (time * gain * sensitivity),
+        mixed * offset / sensitivity**2,
+        mixed * slope / sensitivity,
+    )
 
 
 def _line(seconds: Float64, read: float, photon: float) -> tuple[float, float]:

@@ -14,7 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
-from skindb.fit.lumitexels import cosines, directions
+from skindb.fit.lumitexels import POLARISATION, cosines, directions
 from skindb.geometry.interreflection import bounce_transfer, tangent_frames
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.schema import check, dataset
@@ -213,7 +213,8 @@ def estimate_camera_gains(
     -------
     DataArray
         (camera, channel), whose median over the cameras is 1 in every channel; NaN for
-        cameras that share no usable surfel with others.
+        cameras that share no usable surfel with others, and with polarisers, behind which
+        cameras see different parts of the light from the surface.
     """
     few, lights = _chosen(lumitexels, rng)
     samples = few["reflectance_sample"].values.astype(np.float64)
@@ -231,7 +232,7 @@ def estimate_camera_gains(
     logs[np.isfinite(logs).all(axis=2).sum(axis=1) < 2] = np.nan
     gains = np.full(shape[1:], np.nan)
     shared = np.isfinite(logs).any(axis=(0, 2))
-    if shared.any():
+    if shared.any() and not all(name in lumitexels for name in POLARISATION):
         gains[shared] = np.stack(
             [
                 np.nanmedian(aligned(x), axis=0)
@@ -494,7 +495,7 @@ def bounced_light(
         counts = f"{len(position)}, {len(visible)} and {len(diffuse)} surfels"
         rule = "samples, visibility and R_d must be of the same surfels"
         raise InputError(
-            Fault("inter-reflection", rule, counts, "ingest the capture again")
+            Fault("inter-reflection", rule, counts, "run skindb ingest --again")
         )
     reflectance = np.where(
         np.isfinite(diffuse), diffuse, np.nanmedian(diffuse, axis=0)

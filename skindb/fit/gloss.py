@@ -14,6 +14,7 @@ import xarray as xr
 from skindb.fit.albedo import estimate_diffuse_reflectance
 from skindb.fit.lumitexels import (
     GEOMETRY,
+    POLARISATION,
     block_of,
     directions,
     noise_inputs,
@@ -23,7 +24,7 @@ from skindb.fit.lumitexels import (
 from skindb.fit.normals import estimate_normals
 from skindb.fit.surface import noise_floor
 from skindb.geometry.interreflection import tangent_frames
-from skindb.optics.fresnel import fresnel_transmittance
+from skindb.optics.fresnel import circular_reversal, fresnel_transmittance
 from skindb.parameters import SCAN_ERROR_DEGREES
 from skindb.reflectance._lumitexel_kernels import (
     MIN_COSINE_SURFACE,
@@ -266,6 +267,10 @@ def _errors(
         for w in (wi, wo)
     ]
     value = np.einsum("nlcj,nj->nlc", evaluate_graded(wi, wo), refined.strength)
+    if all(name in part for name in POLARISATION):
+        both = np.outer(*(part[name].values for name in POLARISATION))
+        apart = np.linalg.norm(wi + wo, axis=-1) / 2  # cosine of theta_d
+        value *= 1 - both * circular_reversal(apart, eta)
     value += passed[0] * passed[1] * refined.diffuse.mean(axis=1)[:, None, None] / np.pi
     predicted = np.where(steep, wi[..., 2] * value, np.nan)
     measured = part["reflectance_sample"].values.mean(axis=3)

@@ -28,8 +28,9 @@ MEDIAN_VARIANCE = np.pi / 2
 # used. 0.95 to 0.96 for three to eight faces under strobes; virtual skin: 0.75 to 0.93 under
 # lights that are 1 degree off, 0.98 to 1.01 under lights that are where they are stated
 MAX_LEFT_BY_OFFSETS = 0.97
-# of gains of the cameras that are used: 0.006 are found for perfect cameras
-MIN_CAMERA_SPREAD = 0.012
+# of gains of the cameras that are used: 0.006 are found for perfect cameras of a dome, 0.015
+# for twelve over 240 degrees and a strong broad surface
+MIN_CAMERA_SPREAD = 0.02
 
 
 def take_residuals(

@@ -9,7 +9,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import binary_fill_holes, uniform_filter
+from scipy.ndimage import binary_propagation, uniform_filter
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
 
@@ -192,8 +192,11 @@ def _lit(values: Float32) -> tuple[Mask, float]:
     dim = bright <= DIM_FRACTION * top
     changes = bright - low > MIN_CHANGE * bright
     shown = (bright > BACKGROUND_FRACTION * top) & (changes | ~dim)
-    # dark hair inside the subject may be noise
-    subject = binary_fill_holes(shown & ~(dim & _is_noise(values)))
+    # dark hair inside the subject may be noise, and dark skin inside a mask, beyond which all is 0
+    noise = dim & (bright > 0) & _is_noise(values)
+    border = np.ones(noise.shape, bool)
+    border[1:-1, 1:-1] = False
+    subject = ~binary_propagation(noise & border, mask=noise)
     lit = np.isfinite(values) & (values > SHADOW_FRACTION * bright) & (values > 0)
     return lit & shown & subject, float((shown & ~subject).mean())
 

@@ -24,7 +24,7 @@ from skindb.errors import Fault, InputError, input_error
 from skindb.store.place import BLOCK_BYTES, Digests, Place, block_digests
 from skindb.store.record import Record, json_object
 
-CURE = "restore this file from a backup, or compute the version again"
+CURE = "restore this file from a backup, or compute the version again (ingest --again)"
 AS_COMMITTED = "a version must be as it was committed"
 CHANGED = "content that differs from what was committed"
 DTYPES = {  # bytes per element; that of a string is a reference

@@ -163,7 +163,7 @@ def _unchanged(
         return None  # the ingest refuses it
     record = db.record("capture", capture.take)
     stored = record.provenance
-    if stored.get("code_digest") != code_digest(ingest_capture):
+    if stored.get("code_digest") != _ingest_digest():
         return None
     expected = plain(capture_provenance(capture, asdict(parameters), Digests()))
     same = all(stored[key] == expected[key] for key in ("inputs", "parameters"))
@@ -231,8 +231,15 @@ def _ingest(
                 if progress is not None:
                     progress("write", 1, 1)
                 provenance = {str(name): value for name, value in tree.attrs.items()}
-                digest = {"code_digest": code_digest(ingest_capture)}
+                digest = {"code_digest": _ingest_digest()}
                 return stage.commit(provenance | digest)
+
+
+def _ingest_digest() -> str:
+    """Digest of the code that reads a capture, applies its calibration and ingests it."""
+    return code_digest(
+        read_capture, calibrated_probe, *APPLIED.values(), ingest_capture
+    )
 
 
 def _require_admitted(db: Database, take: str, scratch: Path) -> None:

@@ -200,6 +200,7 @@ def _lights(record: Record, capture: xr.DataTree) -> dict[str, Float64]:
     is_from_setup = (
         record.provenance.get("calibrated_by")
         and variables.LIGHT_GAIN_APPLIED not in dome
+        and variables.CAMERA_GAIN_APPLIED not in dome
         and variables.LOBE_STRENGTH_APPLIED not in dome
     )
     require(

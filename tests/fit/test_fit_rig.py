@@ -207,3 +207,17 @@ def test_estimate_camera_gains__one_camera_has_none(new_skin):
     group = common_camera_gains([gains] * 3)
     assert (group["rig_camera_gain"] == 1).all()
     assert np.isnan(group["rig_camera_spread"])
+
+
+def test_estimate_camera_gains__none_with_polarisers(new_skin):
+    """Crossed and parallel cameras see different parts of the light from the surface."""
+    skin = new_skin(surfels=50, lights=20, cameras=4)
+    samples = skin.lumitexels.assign(
+        surfel_normal=label("surfel_normal", skin.normal.astype(np.float32)),
+        light_polarisation=label("light_polarisation", np.ones(20, np.float32)),
+        camera_polarisation=label(
+            "camera_polarisation", np.array([1, -1, 1, -1], np.float32)
+        ),
+    )
+    gains = estimate_camera_gains(samples, rng=np.random.default_rng(0))
+    assert np.isnan(gains).all()

@@ -204,6 +204,10 @@ def test_radiance_noise__lens_and_colours():
     behind = radiance_noise(camera, [1.0], 0.5)
     for found, times in zip(behind, (limit * 2, read * 4, shot * 2), strict=True):
         np.testing.assert_allclose(found, times, rtol=1e-9)
+    # a camera that is more sensitive than stated has more photons in the same radiance
+    sensitive = radiance_noise(replace(camera, gain=(2.0, 2.0, 2.0)), [1.0], 1.0)
+    for found, times in zip(sensitive, (limit / 2, read / 4, shot / 2), strict=True):
+        np.testing.assert_allclose(found, times, rtol=1e-9)
     mixed = radiance_noise(replace(camera, colour_matrix=matrix), [1.0], 1.0)
     np.testing.assert_allclose(
         mixed[2][:, 0] / shot[:, 0], (matrix**2).sum(axis=1), rtol=1e-9
