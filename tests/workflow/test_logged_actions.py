@@ -28,6 +28,7 @@ LOG_THEMSELVES = {
     "calibrate_rig",
     "clean",
     "create_release",
+    "ingest_if_changed",
     "ingest_take",
     "record_consent",
     "study",
