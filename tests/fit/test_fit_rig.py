@@ -15,6 +15,17 @@ from skindb.schema import label
 DISTANCE_MM = 880.0  # of the lights of virtual skin
 
 
+def brightened(skin, factors):
+    """Samples with the true normals, times factors."""
+    sample = skin.lumitexels["reflectance_sample"].values.astype(np.float32)
+    return skin.lumitexels.assign(
+        surfel_normal=label("surfel_normal", skin.normal.astype(np.float32)),
+        reflectance_sample=label(
+            "reflectance_sample", (sample * factors).astype(np.float16)
+        ),
+    )
+
+
 def common(gains):
     gains = np.array(gains, float)
     return Common([LightErrors(g, np.zeros((len(g), 3))) for g in gains])
@@ -88,14 +99,7 @@ def test_common_light_errors__right_lights_stay_although_the_estimates_are_alike
     takes = []
     for seed in range(3):
         skin = new_skin(surfels=100, lights=30, cameras=4, noise=0.01, seed=seed)
-        sample = skin.lumitexels["reflectance_sample"].values.astype(np.float32)
-        samples = skin.lumitexels.assign(
-            surfel_normal=label("surfel_normal", skin.normal.astype(np.float32)),
-            reflectance_sample=label(
-                "reflectance_sample",
-                (sample * common[:, None, None]).astype(np.float16),
-            ),
-        )
+        samples = brightened(skin, common[:, None, None])
         takes.append(light_residuals(samples, rng=np.random.default_rng(0)))
     names = [str(k) for k in range(30)]
     position = skin.lumitexels["light_position"].values
@@ -177,13 +181,7 @@ def test_common_camera_gains__are_found_and_those_of_perfect_cameras_are_1(
     takes = []
     for seed in range(3):
         skin = new_skin(surfels=200, lights=40, cameras=6, noise=0.01, seed=seed)
-        sample = skin.lumitexels["reflectance_sample"].values.astype(np.float32)
-        samples = skin.lumitexels.assign(
-            surfel_normal=label("surfel_normal", skin.normal.astype(np.float32)),
-            reflectance_sample=label(
-                "reflectance_sample", (sample * planted).astype(np.float16)
-            ),
-        )
+        samples = brightened(skin, planted)
         takes.append(estimate_camera_gains(samples, rng=np.random.default_rng(0)))
     group = common_camera_gains(takes)
     gain = group["rig_camera_gain"].values
