@@ -2,7 +2,7 @@
 et al. 2005, section 10.2).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -17,22 +17,17 @@ from skindb.errors import require
 from skindb.geometry.atlas import bilinear, push_pull
 from skindb.numerics.factorise import principal_axes
 from skindb.numerics.texture import (
-    BINS,
-    QUANTILES,
-    Bins,
     Synthesis,
-    common_bins,
     image_parts,
     part_members,
     part_names,
     part_quantiles,
-    quantile_function,
     synthesise,
 )
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.label import FACE
-from skindb.types import Array, Index, Mask, finite_rows
+from skindb.types import Array, Mask, finite_rows
 
 SIZE = 1024  # texels along each side
 REGIONS = (FACE, "beard", "no_beard")
@@ -52,14 +47,6 @@ KEPT_VARIANCE = 0.99
 MIN_TAKES_DISTANCE = 4  # takes needed for that distance
 
 
-@dataclass(frozen=True)
-class Moments:
-    """Mean (3,) and scatter (3, 3) of the log albedo of a take's measured texels."""
-
-    mean: Array
-    scatter: Array
-
-
 def texel_regions(landmarks: Mapping[str, Array], size: int = SIZE) -> dict[str, Mask]:
     """Masks (v, u) of the regions in the common (u, v): the whole face, the beard, and
     the skin without a beard.
@@ -71,17 +58,16 @@ def texel_regions(landmarks: Mapping[str, Array], size: int = SIZE) -> dict[str,
 def texture_statistics(
     cohort: xr.Dataset, *, landmarks: Mapping[str, Array], mixed_fits: bool = False
 ) -> xr.Dataset:
-    """Histograms and quantile functions of log albedo and of its bands, for every take and region.
+    """Quantile functions of log albedo and of its bands, for every take and region.
 
     The logarithm is used because pigments attenuate by a factor: a change of pigment
     adds the same step at every texel, and no sum of steps leads to a negative albedo.
     Colour is decorrelated with the principal axes of the texels of all takes, each take
     with the same weight, divided by their standard deviations (Heeger and Bergen 1995,
     section 3.5). Every axis is decomposed into a steerable pyramid of 7 levels and 4
-    orientations; its 30 parts and the image itself have 256 bins each, with the same
-    edges for all takes: 23,808 numbers for each take and region. The width of the bins
-    is the smallest power of 2 with which they contain every texel of every take, so
-    that every take is read once for them.
+    orientations; its 30 parts and the image itself have 256 quantiles each: 23,808
+    numbers for each take and region. Means and differences of quantile functions are
+    distributions again; those of histograms are mixtures.
 
     Parameters
     ----------
@@ -95,10 +81,10 @@ def texture_statistics(
     Returns
     -------
     Dataset
-        `texture_colour_mean`, `texture_colour_axis` (of log R_d), `texture_edge`,
-        `texture_histogram`, `texture_quantile`, `texture_coverage` (fraction of the
-        texels of the region that the take has measured; below one half, its
-        distributions are NaN), `texture_region`.
+        `texture_colour_mean`, `texture_colour_axis` (of log R_d),
+        `texture_quantile`, `texture_coverage` (fraction of the texels of the region that
+        the take has measured; below one half, its distributions are NaN),
+        `texture_region`.
 
     Raises
     ------
@@ -111,24 +97,30 @@ def texture_statistics(
     masks = texel_regions(landmarks, size)
     names = list(masks)
     drawn = np.stack([masks[name] for name in names])
-    mean, axes = _axes(each_take(_moments, cohort, MAPPED))
-    takes = each_take(_distributions, cohort, MAPPED, drawn, mean, axes)
+    moments = [take for take in each_take(_moments, cohort, MAPPED) if take is not None]
     require(
-        any(np.isfinite(take.quantiles).any() for take in takes),
+        moments,
+        "texture",
+        "some texels must be measured",
+        "none",
+        "fit or register more takes",
+    )
+    mean, axes = colour_axes(*zip(*moments, strict=True))
+    takes = each_take(_distributions, cohort, MAPPED, drawn, mean, axes)
+    quantiles, covered = (np.stack(values) for values in zip(*takes, strict=True))
+    require(
+        np.isfinite(quantiles).any(),
         "texture",
         "at least one take must have measured half of a region",
         f"none of {len(takes)} takes",
         "fit or register more takes",
     )
-    edges, histograms = _histograms(takes)
     return dataset(
         {
             variables.TEXTURE_COLOUR_MEAN: mean,
             variables.TEXTURE_COLOUR_AXIS: axes,
-            variables.TEXTURE_EDGE: edges,
-            variables.TEXTURE_HISTOGRAM: histograms,
-            variables.TEXTURE_QUANTILE: np.stack([take.quantiles for take in takes]),
-            variables.TEXTURE_COVERAGE: np.stack([take.covered for take in takes]),
+            variables.TEXTURE_QUANTILE: quantiles,
+            variables.TEXTURE_COVERAGE: covered,
             variables.TEXTURE_REGION: drawn,
         },
         coords={
@@ -139,15 +131,6 @@ def texture_statistics(
         },
         attrs={"skipped": skipped_takes(cohort)},
     )
-
-
-@dataclass(frozen=True)
-class Distributions:
-    """Distributions of a take's texels in each region, axis and part."""
-
-    quantiles: Array  # (region, axis, part, QUANTILES)
-    bins: list[list[Bins]]  # of each axis and part; empty without measured regions
-    covered: Array  # (region,) fraction of its texels that are measured
 
 
 def log_albedo(maps: xr.Dataset) -> tuple[Array, Mask]:
@@ -176,29 +159,15 @@ def decorrelated(log: Array, mean: Array, axes: Array) -> Array:
     return images.reshape(-1, *log.shape[:-1]).astype(np.float32, copy=False)
 
 
-def _moments(maps: xr.Dataset) -> Moments | None:
+def _moments(maps: xr.Dataset) -> tuple[Array, Array] | None:
+    """Mean (3,) and covariance (3, 3) of the log albedo of a take; None if it is unknown."""
     log, measured = _measured_log(maps)
     if not measured.any():
         return None
     rows = log.reshape(-1, log.shape[-1]).take(np.flatnonzero(measured), axis=0)
     mean = rows.mean(axis=0, dtype=float)
     from_mean = rows - mean
-    return Moments(mean, from_mean.T @ from_mean / len(rows))
-
-
-def _axes(moments: list[Moments | None]) -> tuple[Array, Array]:
-    """Common mean (3,) and axes (3, 3) in rows; the variance includes differences between takes."""
-    measured = [take for take in moments if take is not None]
-    require(
-        measured,
-        "texture",
-        "some texels must be measured",
-        "none",
-        "fit or register more takes",
-    )
-    return colour_axes(
-        [take.mean for take in measured], [take.scatter for take in measured]
-    )
+    return mean, from_mean.T @ from_mean / len(rows)
 
 
 def colour_axes(
@@ -218,51 +187,22 @@ def colour_axes(
     return mean, axes * np.where(axes.sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
 
 
-def _covered(measured: Mask, drawn: Mask) -> Array:
-    """Fraction (region,) of the texels of each region that are measured; for the face,
-    of the whole map.
-    """
-    return np.array(
-        [(measured & region).sum() / max(region.sum(), 1) for region in drawn]
-    )
-
-
 def _distributions(
     maps: xr.Dataset, drawn: Mask, mean: Array, axes: Array
-) -> Distributions:
-    """Distributions of a take; NaN and no values for regions that it has not measured."""
-    log, measured = log_albedo(maps)
-    covered = _covered(measured, drawn)
-    # the first region is the face, which needs no minimum coverage
-    enough = covered >= np.array([0.0, *[LEAST_COVERED] * (len(drawn) - 1)])
-    masks = drawn & measured & enough[:, None, None]
-    inside: list[list[Index]] = []
-    quantiles = np.empty((len(drawn), AXES, len(part_names()), QUANTILES), np.float32)
-    bins: list[list[Bins]] = []
-    for a, image in enumerate(decorrelated(log, mean, axes)):
-        parts = image_parts(image)
-        inside = inside or [part_members(mask, parts) for mask in masks]
-        bins.append([])
-        for p, part in enumerate(parts):
-            values = [part.take(index[p]) for index in inside]
-            quantiles[:, a, p] = [quantile_function(region) for region in values]
-            bins[a].append(Bins.of(values))
-    return Distributions(quantiles, bins, covered)
-
-
-def _histograms(takes: Sequence[Distributions]) -> tuple[Array, Array]:
-    """Edges (axis, part, BINS + 1) that contain every texel of every take, and
-    fractions (take, region, axis, part, bin) of the texels of each take.
+) -> tuple[Array, Array]:
+    """Quantiles (region, axis, part, level) of a take, NaN for regions of which it has
+    measured less than half, and the measured fractions (region,); the face, which is
+    the first region, needs no minimum coverage.
     """
-    count, axes, parts, _ = takes[0].quantiles.shape
-    edges = np.empty((axes, parts, BINS + 1))
-    histograms = np.empty((len(takes), count, axes, parts, BINS), np.float32)
-    for a, p in np.ndindex(axes, parts):
-        bins = [take.bins[a][p] for take in takes]
-        exponent, first = common_bins(bins)
-        edges[a, p] = (first + np.arange(BINS + 1)) * 2.0**exponent
-        histograms[:, :, a, p] = [own.merged(exponent, first) for own in bins]
-    return edges, histograms
+    log, measured = log_albedo(maps)
+    covered = np.array(
+        [(measured & region).sum() / max(region.sum(), 1) for region in drawn]
+    )
+    enough = covered >= LEAST_COVERED
+    enough[0] = True
+    masks = drawn & measured & enough[:, None, None]
+    quantiles = _quantiles(decorrelated(log, mean, axes), masks)
+    return quantiles.astype(np.float32), covered
 
 
 @dataclass(frozen=True)
@@ -282,14 +222,13 @@ def edit_texture(
     texture: xr.Dataset,
     *,
     iterations: int = ITERATIONS,
-    as_one_region: bool = False,
     rng: np.random.Generator,
 ) -> TextureEdit:
     """Shift the distributions of a take's albedo in the common (u, v).
 
     The beard region is matched to its own distributions, the rest of the face to those
-    of the region without a beard. If the population has no such regions, or if `as_one_region`
-    is set, the face is matched as one region.
+    of the region without a beard. If the population has no such regions, the face is
+    matched as one region.
 
     Parameters
     ----------
@@ -302,8 +241,6 @@ def edit_texture(
         From `texture_statistics`.
     iterations
         See `skindb.numerics.texture.synthesise`.
-    as_one_region
-        Match the face as one region.
     rng
         Random generator of the noise.
     """
@@ -312,8 +249,7 @@ def edit_texture(
     axes = texture[variables.TEXTURE_COLOUR_AXIS].values
     drawn = texture[variables.TEXTURE_REGION].values.astype(np.float32)
     log, measured = log_albedo(maps)
-    halves = not as_one_region and {BEARD, REST} <= set(names)
-    halves = halves and bool(
+    halves = {BEARD, REST} <= set(names) and bool(
         np.isfinite(shift[[names.index(BEARD), names.index(REST)], :, 0]).all()
     )
     if halves:
@@ -360,15 +296,13 @@ def at_surfels(change: Array, uv: Array) -> Array:
     return bilinear(change, np.clip(uv, 0.0, 1.0) * size)
 
 
-def _quantiles(images: Array | list[Array], counted: list[Array]) -> Array:
-    """Quantiles (region, axis, part, level) of the images of three axes."""
-    out = []
-    for image in images:
-        parts = image_parts(np.asarray(image, np.float32))
-        out.append(
-            [part_quantiles(parts, part_members(mask, parts)) for mask in counted]
-        )
-    return np.moveaxis(np.array(out), 0, 1)
+def _quantiles(images: Iterable[Array], masks: Iterable[Array]) -> Array:
+    """Quantiles (region, axis, part, level) of the images of three axes in regions (v, u)."""
+    parts = [image_parts(np.asarray(image, np.float32)) for image in images]
+    inside = [part_members(mask, parts[0]) for mask in masks]
+    return np.array(
+        [[part_quantiles(axis, index) for axis in parts] for index in inside]
+    )
 
 
 def _distances(

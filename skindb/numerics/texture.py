@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from math import factorial, floor, frexp, pi, sqrt
+from math import factorial, pi, sqrt
 from typing import Any
 
 import numpy as np
@@ -35,8 +35,6 @@ LEVELS = 7
 ORIENTATIONS = 4
 MAX_SHAPES = LEVELS + 1  # whose masks are kept: 25 MB for images of 1024 x 1024
 QUANTILES = 256  # entries of a quantile function
-BINS = 256  # of a histogram
-MIN_EXPONENT = -126  # of the width of a bin: the inverse is finite in single precision
 # values; a quantile of this many is accurate to 0.14 % of all ranks, a third of a level
 MAX_SORTED = 1 << 17
 # standard deviation of the noise added before matching, relative to that of the
@@ -335,59 +333,6 @@ def part_quantiles(parts: Sequence[Image], inside: Sequence[Index]) -> Float64:
     """Quantiles (part, QUANTILES) of the entries with these indices, see `part_members`."""
     pairs = zip(parts, inside, strict=True)
     return np.stack([quantile_function(part.take(index)) for part, index in pairs])
-
-
-@dataclass(frozen=True)
-class Bins:
-    """Numbers of values in bins whose width is a power of 2 and whose edges are
-    multiples of it, so that the bins of several parts merge into wider ones exactly.
-    """
-
-    exponent: int  # of the width
-    first: int  # lower edge of the first bin over the width
-    last: int  # that of the last bin with values
-    counts: NDArray[np.uint32]  # (region, BINS)
-
-    @classmethod
-    def of(cls, regions: Sequence[Image]) -> Bins:
-        """The narrowest bins that contain the values (n,) of all regions; a bin at 0
-        without any.
-        """
-        low = min((float(x.min()) for x in regions if x.size), default=0.0)
-        high = max((float(x.max()) for x in regions if x.size), default=0.0)
-        # single precision distinguishes no narrower bins
-        exponent = max(frexp(max(abs(low), abs(high)))[1] - 24, MIN_EXPONENT)
-        while floor(high * 2.0**-exponent) - floor(low * 2.0**-exponent) >= BINS:
-            exponent += 1
-        first = floor(low * 2.0**-exponent)
-        counts = np.zeros((len(regions), BINS), np.uint32)
-        for row, values in zip(counts, regions, strict=True):
-            numbers = np.floor(values * values.dtype.type(2.0**-exponent)) - first
-            row[:] = np.bincount(numbers.astype(np.intp), minlength=BINS)
-        return cls(exponent, first, floor(high * 2.0**-exponent), counts)
-
-    def merged(self, exponent: int, first: int) -> Float64:
-        """Fractions (region, BINS) of the values of each region in wider bins, NaN for
-        a region without values.
-        """
-        place = (self.first + np.arange(self.last - self.first + 1)) >> (
-            exponent - self.exponent
-        )
-        counts = np.zeros(self.counts.shape)
-        np.add.at(counts.T, place - first, self.counts[:, : len(place)].T)
-        total = counts.sum(axis=1, keepdims=True)
-        return np.where(total > 0, counts / np.maximum(total, 1), np.nan)
-
-
-def common_bins(parts: Sequence[Bins]) -> tuple[int, int]:
-    """Exponent and first bin of the narrowest bins into which those of all parts merge."""
-    exponent = max(bins.exponent for bins in parts)
-    while True:
-        first = min(bins.first >> (exponent - bins.exponent) for bins in parts)
-        last = max(bins.last >> (exponent - bins.exponent) for bins in parts)
-        if last - first < BINS:
-            return exponent, first
-        exponent += 1
 
 
 def valid_quantiles(values: Float64) -> Float64:

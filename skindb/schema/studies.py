@@ -231,19 +231,10 @@ TEXTURE_COLOUR_AXIS = declare(
     "rows: decorrelated axes of the logarithm of R_d over their standard deviation",
     "Heeger and Bergen 1995, section 3.5",
 )
-TEXTURE_EDGE = declare(
-    "float64 texture/texture_edge(axis, part, edge) [1]",
-    "bin edges, shared by all takes",
-)
-TEXTURE_HISTOGRAM = declare(
-    "float32 texture/texture_histogram(take, region, axis, part, bin) [1]",
-    "fraction of the region's texels per bin, of log albedo and of each band of its "
-    "steerable pyramid",
-    f"{PAPER}, section 10.2",
-)
 TEXTURE_QUANTILE = declare(
     "float32 texture/texture_quantile(take, region, axis, part, level) [1]",
-    "quantiles of the same, in standard deviations of the decorrelated axis",
+    "quantiles of log albedo and of each band of its steerable pyramid, in standard "
+    "deviations of the decorrelated axis",
 )
 TEXTURE_COVERAGE = declare(
     "float64 texture/texture_coverage(take, region) [1]",

@@ -8,11 +8,8 @@ from scipy.ndimage import gaussian_filter
 from skimage.exposure import match_histograms
 
 from skindb.numerics.texture import (
-    BINS,
     QUANTILES,
-    Bins,
     build,
-    common_bins,
     image_parts,
     level_fractions,
     members,
@@ -67,58 +64,6 @@ def test_part_members__are_those_of_the_fractions():
         parts, part_members(mask, parts), fractions, strict=True
     ):
         np.testing.assert_array_equal(part.take(index), part[members(fraction)])
-
-
-def edges_of(exponent, first):
-    return (first + np.arange(BINS + 1)) * 2.0**exponent
-
-
-EXTREMES = [
-    noise((5000,)),
-    np.exp(noise((5000,))),
-    1e30 * noise((500,)),
-    1e-30 * noise((500,)),
-    1e6 + 1e-3 * noise((500,)),
-    np.full(3, -0.7),
-    np.zeros(4),
-]
-
-
-def test_bins__are_the_narrowest_and_those_of_numpy():
-    for values in EXTREMES:
-        values = values.astype(np.float32)
-        bins = Bins.of([values, values[:0], values[::2]])
-        edges = edges_of(bins.exponent, bins.first)
-        assert edges[0] <= values.min()
-        assert values.max() < edges[-1]
-        found = bins.merged(bins.exponent, bins.first)
-        for row, region in zip(found[[0, 2]], (values, values[::2]), strict=True):
-            np.testing.assert_array_equal(
-                row, np.histogram(region, edges)[0] / len(region)
-            )
-        assert np.isnan(found[1]).all()
-        width = 2.0**bins.exponent
-        if np.ptp(values) > 2.0**-20 * np.abs(values).max():
-            assert np.ptp(values) > (BINS / 2 - 1) * width
-
-
-def test_common_bins__merge_exactly():
-    """Fractions in the bins of all parts, whatever the ranges of the single ones."""
-    regions = [x.astype(np.float32) for x in (noise((999,)), 7 + noise((300,)) / 50)]
-    regions.append(np.full(5, 0.1, np.float32))
-    parts = [Bins.of([region]) for region in regions]
-    exponent, first = common_bins(parts)
-    edges = edges_of(exponent, first)
-    assert edges[0] <= np.concatenate(regions).min()
-    assert np.concatenate(regions).max() < edges[-1]
-    for part, region in zip(parts, regions, strict=True):
-        np.testing.assert_array_equal(
-            part.merged(exponent, first)[0],
-            np.histogram(region, edges)[0] / len(region),
-        )
-    assert exponent > parts[1].exponent
-    # half as wide would not contain all
-    assert edges[-1] - edges[0] < 4 * np.ptp(np.concatenate(regions))
 
 
 @pytest.mark.parametrize("shape", [(64, 64), (63, 50), (17, 128)])
