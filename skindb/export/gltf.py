@@ -37,9 +37,7 @@ def export_gltf(
     KHR_materials_ior. The base colour is from R_d and the flat part of the measured
     BRDFs; roughness, specular factor and specular colour are from the reduced basis,
     such that pictures differ as little as possible (`fit_material`). Shading normals
-    are a texture in tangent space. If parts of the face, such as an ear, are so thin
-    that they transmit 1 % of the diffuse light, the material also has
-    KHR_materials_diffuse_transmission. glTF has neither measured BRDFs nor subsurface
+    are a texture in tangent space. glTF has neither measured BRDFs nor subsurface
     transport over a distance. The resulting error is written to `extras` of the
     material and returned.
 
@@ -163,13 +161,6 @@ def _material(extras: dict[str, Any], skin: Skin) -> dict[str, Any]:
         "KHR_materials_ior": {"ior": float((1 + root) / (1 - root))},
         "KHR_materials_specular": specular | {"specularColorFactor": [1.0, 1.0, 1.0]},
     }
-    if "diffuseTransmission" in skin.pictures:
-        texture = {"index": list(skin.pictures).index("diffuseTransmission")}
-        extensions["KHR_materials_diffuse_transmission"] = {
-            "diffuseTransmissionFactor": skin.transmitted,
-            "diffuseTransmissionTexture": texture,
-            "diffuseTransmissionColorTexture": texture,
-        }
     return {
         "name": f"{extras['take']}_skin",
         "doubleSided": True,
@@ -190,7 +181,6 @@ def _extras(model: xr.DataTree, skin: Skin) -> dict[str, Any]:
         ),
         "edited": describe_edit(model.attrs),
         "approximation_error": skin.error,
-        "largest_transmitted_fraction": skin.transmitted,
         "skipped": [
             "subsurface transport",
             "retro-reflection and other details of the measured lobes",

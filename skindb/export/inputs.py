@@ -1,5 +1,5 @@
 """What an export needs of a model: checks, the size of its maps, the description of an edit, and
-translucency for programs without the dipole.
+the mean free path for programs without the dipole.
 """
 
 from collections.abc import Mapping
@@ -8,19 +8,13 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.errors import input_error
 from skindb.files import plain
-from skindb.geometry.rays import RAY_OFFSET_MM, RayScene
-from skindb.optics.diffusion import (
-    dipole_power_beyond,
-    dipole_s,
-    scattering_coefficients,
-)
+from skindb.optics.diffusion import dipole_s
 from skindb.render.surfels import with_matt_surfels
 from skindb.schema import check, variables
-from skindb.types import Array, dots, float64, lengths
+from skindb.types import Array, float64, lengths
 
 REQUIRED = (
     variables.SURFEL_POSITION,
@@ -174,57 +168,4 @@ def mean_free_path(diffuse: Array, sigma_tr: Array, *, eta: float) -> Array:
         (MEAN_FREE_PATH_OFFSET + MEAN_FREE_PATH_PER_ALBEDO * float64(diffuse))
         * s
         / sigma_tr
-    )
-
-
-def thickness(position: Array, normal: Array, triangles: NDArray[np.integer]) -> Array:
-    """Distance [mm] (n,) from each vertex straight inwards to where the mesh ends;
-    infinity where it does not.
-
-    A ray that first meets a triangle from its outer side has left the body through an
-    opening of the scan: there, too, the thickness counts as infinite.
-
-    Parameters
-    ----------
-    position, normal
-        (n, 3) mm and (n, 3) unit normals that point outwards.
-    triangles
-        (f, 3), counter-clockwise seen from outside.
-    """
-    face, _, distance = RayScene(position, triangles).first_hit(
-        position - RAY_OFFSET_MM * normal, -normal
-    )
-    corner = position[triangles[np.maximum(face, 0)]]
-    outwards = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    leaves = (face >= 0) & (dots(outwards, normal) < 0)
-    return np.where(leaves, distance + RAY_OFFSET_MM, np.inf)
-
-
-def transmitted_fraction(
-    distance: Array, diffuse: Array, sigma_tr: Array, *, eta: float
-) -> Array:
-    """Fraction (n, 3) of the diffuse light at a surface that comes from the other side,
-    if both are lit evenly.
-
-    The light of the other side is the dipole's power beyond the thickness, and both
-    sides together give R_d, as in `skindb.optics.dipole_tree.subsurface_exitance`.
-
-    Parameters
-    ----------
-    distance
-        (n,) thickness in mm; infinity gives 0.
-    diffuse, sigma_tr
-        (n, 3) R_d, and mm^-1. Where sigma_tr is not known the fraction is 0.
-    eta
-        Refractive index of the skin.
-    """
-    finite = np.isfinite(sigma_tr) & np.isfinite(distance)[:, None]
-    s, _ = dipole_s(diffuse, eta=eta)
-    absorption, scattering = scattering_coefficients(s, np.where(finite, sigma_tr, 1.0))
-    beyond, here = (
-        dipole_power_beyond(depth, absorption, scattering, eta=eta)
-        for depth in (np.where(finite, distance[:, None], 0.0), 0.0)
-    )
-    return np.where(
-        finite & (here > 0), beyond / np.maximum(beyond + here, 1e-300), 0.0
     )

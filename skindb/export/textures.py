@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 from scipy import ndimage
 
-from skindb.export.inputs import chosen_size, required, thickness, transmitted_fraction
+from skindb.export.inputs import chosen_size, required
 from skindb.export.maps import atlas_images, tangent_frames, to_tangent_space
 from skindb.optics.angles import directions
 from skindb.optics.fresnel import fresnel_transmittance
@@ -42,8 +42,6 @@ MAX_F0 = 0.3  # reflectance at normal incidence, for an index of refraction of 3
 DEFAULT_F0 = 0.04
 ERROR_POINTS = 512  # surfels on which the approximation is compared with the model
 MIN_F0 = 1e-3  # reflectance at normal incidence, for the index of refraction in files
-# largest fraction of transmitted diffuse light below which there is no texture for it
-MIN_TRANSMITTED = 0.01
 
 
 @dataclass(frozen=True)
@@ -362,8 +360,7 @@ class Skin:
     one that has no specular factor either, as UsdPreviewSurface.
     """
 
-    # baseColor, metallicRoughness, specular, specularColor, normal, and
-    # diffuseTransmission if parts are thin
+    # baseColor, metallicRoughness, specular, specularColor and normal
     pictures: dict[str, Bytes]
     shape: Shape
     top_f0: float  # reflectance at normal incidence for a white specularColor
@@ -373,9 +370,6 @@ class Skin:
     error: dict[str, float]
     error_of_one_index: dict[str, float]
     error_of_preview: dict[str, float]
-    # largest fraction of the diffuse light at a point that comes through the skin from
-    # behind
-    transmitted: float
 
     def files(self) -> dict[str, bytes]:
         """PNG files with one quantity each: baseColor, roughness, specularFactor and normal."""
@@ -428,16 +422,13 @@ def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
     )
     shape = _shape(fitted, mesh[variables.TRIANGLE].values)
     top = float(max(skin.f0.max(), MIN_F0))
-    through = _through(fitted, shape, trusted, eta)
-    columns = _columns(skin, trusted, shape, top, through)
+    columns = _columns(skin, trusted, shape, top)
     images, layout = atlas_images(model, columns, trust, size=chosen_size(model, size))
     values = np.split(images, np.cumsum([*layout.values()])[:-1], axis=-1)
     pictures = _textures(dict(zip(layout, values, strict=True)))
     error["normal_error_degrees"] = _normal_error(pictures["normal"], shape, trusted)
     f0 = (top, max(mean_f0, MIN_F0), reflection)
-    return Skin(
-        pictures, shape, *f0, error, of_one_index, of_preview, float(through.max())
-    )
+    return Skin(pictures, shape, *f0, error, of_one_index, of_preview)
 
 
 def _errors(
@@ -485,28 +476,8 @@ def _shape(fitted: xr.Dataset, triangles: AnyArray) -> Shape:
     return Shape(place.astype(np.float32), normal, shading, tangent, uv, triangles)
 
 
-def _through(fitted: xr.Dataset, shape: Shape, surfels: Index, eta: float) -> Float64:
-    """Fraction of the diffuse light (n, 3) at the known surfels that comes through the
-    skin from the other side.
-    """
-    if variables.SIGMA_TR not in fitted:
-        return np.zeros((len(surfels), 3))
-    diffuse, sigma_tr = (
-        fitted[name].values[surfels]
-        for name in (variables.DIFFUSE_REFLECTANCE, variables.SIGMA_TR)
-    )
-    deep = thickness(shape.position.astype(float), shape.normal, shape.triangles)[
-        surfels
-    ]
-    return float64(transmitted_fraction(deep, diffuse, sigma_tr, eta=eta))
-
-
 def _columns(
-    skin: Material,
-    surfels: Index,
-    shape: Shape,
-    top: float,
-    through: Float64,
+    skin: Material, surfels: Index, shape: Shape, top: float
 ) -> dict[str, Float32]:
     """Values (n, c) of the textures at every surfel; 0 where nothing was fitted."""
 
@@ -516,28 +487,20 @@ def _columns(
         return out
 
     bent = to_tangent_space(shape.shading, shape.normal, shape.tangent)
-    columns = {
+    return {
         "base": spread(skin.base_color),
         "roughness": spread(skin.roughness[:, None]),
         "specular": spread(skin.specular[:, None]),
         "f0": spread(np.minimum(skin.f0 / top, 1.0)[:, None]),
         "bent": spread(bent[surfels]),
     }
-    # strength times colour is `through` times the base colour
-    if through.max() >= MIN_TRANSMITTED:
-        strength = through.max(axis=1, keepdims=True)
-        columns["strength"] = spread(strength / through.max())
-        columns["passed"] = spread(
-            skin.base_color * through / np.maximum(strength, 1e-12)
-        )
-    return columns
 
 
 def _textures(values: dict[str, Float32]) -> dict[str, Bytes]:
     """8-bit textures, by their name in the material."""
     full = np.full(values["roughness"].shape, 255, np.uint8)
     bent = unit(values["bent"])
-    pictures = {
+    return {
         "baseColor": _eight_bits(encode_srgb(values["base"])),
         "metallicRoughness": np.concatenate(
             [full, _eight_bits(values["roughness"]), 0 * full], axis=-1
@@ -548,11 +511,6 @@ def _textures(values: dict[str, Float32]) -> dict[str, Bytes]:
         "specularColor": np.repeat(_eight_bits(encode_srgb(values["f0"])), 3, axis=-1),
         "normal": _eight_bits(0.5 * bent + 0.5),
     }
-    if "passed" in values:
-        colour = _eight_bits(encode_srgb(values["passed"]))
-        strength = _eight_bits(values["strength"])
-        pictures["diffuseTransmission"] = np.concatenate([colour, strength], axis=-1)
-    return pictures
 
 
 def _eight_bits(values: AnyArray) -> Bytes:

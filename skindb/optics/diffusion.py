@@ -119,24 +119,6 @@ def dipole_profile(
     return np.asarray(s / (a + s) / (4.0 * np.pi) * total)
 
 
-def dipole_power_beyond(
-    distance: ArrayLike, sigma_a: ArrayLike, sigma_s_prime: ArrayLike, *, eta: float
-) -> Array:
-    """Fraction of the entered power that leaves farther than `distance` [mm] from where it entered.
-
-    The integral of 2 pi r R(r) from `distance` to infinity, in closed form; at 0 it is
-    R_d (eq. 5). Arguments broadcast. It is also the exitance of a plane at that
-    distance from an evenly lit one.
-    """
-    r, a, s = (float64(x) for x in (distance, sigma_a, sigma_s_prime))
-    decay, sources = _sources(a, s, eta)
-    total = np.zeros(())
-    for z in sources:
-        d = np.sqrt(r * r + z * z)
-        total = total + z / d * np.exp(-decay * d)
-    return np.asarray(s / (a + s) / 2.0 * total)
-
-
 def _sources(a: Array, s: Array, eta: float) -> tuple[Array, tuple[Array, Array]]:
     """sigma_tr, and depth of the real and height of the virtual source of the dipole."""
     depth = 1.0 / (a + s)

@@ -14,7 +14,6 @@ import pytest
 import xarray as xr
 
 from skindb.export.gltf import export_gltf
-from tests.export.test_thin_parts import folded
 
 PROGRAM = """
 const validator = require('gltf-validator');
@@ -54,23 +53,6 @@ def test_export_gltf__passes_the_validator(
         "KHR_materials_ior",
         "KHR_materials_specular",
     ]
-
-
-def test_export_gltf__of_a_thin_part_passes_the_validator(
-    model: xr.DataTree, tmp_path: Path, folder: Path
-) -> None:
-    """It does not know the extension yet, a release candidate, and says so of it and of
-    its texture; nothing else.
-    """
-    export_gltf(folded(model, 2.0), tmp_path / "a.glb", size=64)
-    issues = report(folder, tmp_path / "a.glb")["issues"]
-    assert {
-        (message["code"], message["pointer"]) for message in issues["messages"]
-    } == {
-        ("UNSUPPORTED_EXTENSION", "/extensionsUsed/0"),
-        ("UNUSED_OBJECT", "/textures/5"),
-    }
-    assert (issues["numErrors"], issues["numWarnings"]) == (0, 0)
 
 
 def test_validator__finds_a_broken_file(
