@@ -22,7 +22,6 @@ from skindb.errors import InputError, input_error
 
 MAX_CHARACTERS = 1_000
 MAX_DEPTH = 16  # of nested conditions
-MISSING = "missing"  # the word after "is"
 EXAMPLE = "write, for example: condition == 'lotion' and age > 40"
 # text in quotes, a name in backticks, or the start of a comment
 TOKEN = re.compile(r"""('(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*")|`([^`\n]*)`|(\#)""")
@@ -34,7 +33,6 @@ COMPARISONS: dict[type[ast.cmpop], Callable[[Any, Any], Any]] = {
     ast.Gt: operator.gt,
     ast.GtE: operator.ge,
 }
-ORDER = {ast.Lt, ast.LtE, ast.Gt, ast.GtE}
 TEXT = "text"
 NUMBER = "a number"
 TRUTH = "true or false"
@@ -87,9 +85,7 @@ def evaluate(text: str, columns: Mapping[str, Column]) -> tuple[Truth, list[str]
         if isinstance(node, ast.Name) and node.id in names
     ]
     if not operands:
-        raise evaluation.fault(
-            "must name a column of the catalogue", "values alone", EXAMPLE
-        )
+        raise evaluation.fault("must name a column of the catalogue", "values alone")
     return truth, list(dict.fromkeys(operands))
 
 
@@ -111,42 +107,39 @@ class _Evaluation:
     def truth(self, node: ast.expr, depth: int) -> Truth:
         """Whether each row fulfils a part of the condition."""
         if depth > MAX_DEPTH:
-            raise self.fault(
-                f"may be nested {MAX_DEPTH} times",
-                "more levels",
-                "write a simpler condition",
-            )
+            rule = f"may be nested {MAX_DEPTH} times"
+            raise self.fault(rule, "more levels", "write a simpler condition")
         match node:
             case ast.BoolOp(op=op, values=parts):
                 rows = [self.truth(part, depth + 1) for part in parts]
                 return _combined(rows, decisive=isinstance(op, ast.Or))
             case ast.UnaryOp(op=ast.Not(), operand=operand):
                 return _negated(self.truth(operand, depth + 1))
-            case ast.Compare():
-                return self.comparison(node)
+            case ast.Compare(left=left, ops=[op], comparators=[ast.Name(id="missing")]):
+                if isinstance(op, ast.Is | ast.IsNot):
+                    missing: Truth = [is_missing(value) for value in self.values(left)]
+                    return _negated(missing) if isinstance(op, ast.IsNot) else missing
+            case ast.Compare(left=left, ops=[ast.In()], comparators=[right]):
+                return self.contained(left, right)
+            case ast.Compare(left=left, ops=[ast.NotIn()], comparators=[right]):
+                return _negated(self.contained(left, right))
             case ast.Name():
                 return self.truth_of_column(node)
-        raise self.refused(node)
+        if not isinstance(node, ast.Compare):
+            raise self.refused(node)
+        return self.comparison(node)
 
     def comparison(self, node: ast.Compare) -> Truth:
         """Whether each row fulfils a comparison, such as ``20 < age <= 40``."""
-        match node.ops, node.comparators:
-            case [ast.Is() | ast.IsNot() as op], [ast.Name(id="missing")]:
-                missing = Truth(map(is_missing, self.values(node.left)))
-                return missing if isinstance(op, ast.Is) else _negated(missing)
-            case [ast.In() | ast.NotIn() as op], [right]:
-                contained = self.contained(node.left, right)
-                return contained if isinstance(op, ast.In) else _negated(contained)
-        if not {*map(type, node.ops)} <= {*COMPARISONS}:
+        if not {*map(type, node.ops)} <= COMPARISONS.keys():
             raise self.fault(
                 "must use 'is' as in 'age is missing', and 'in' without other "
                 "comparisons beside it",
                 "another use",
-                EXAMPLE,
             )
-        sides = [self.values(side) for side in (node.left, *node.comparators)]
+        sides = map(self.values, (node.left, *node.comparators))
         links = [
-            self.compared(op, *pair)
+            self.compared(type(op), *pair)
             for op, pair in zip(node.ops, pairwise(sides), strict=True)
         ]
         return _combined(links, decisive=False)
@@ -158,7 +151,6 @@ class _Evaluation:
             raise self.fault(
                 "must compare a column of text or numbers",
                 f"{self.column(node.id)} alone",
-                EXAMPLE,
             )
         return [None if is_missing(value) else bool(value) for value in values]
 
@@ -174,11 +166,9 @@ class _Evaluation:
         name = self.names.get(name, name)
         if name in self.columns:
             return name
-        text = (
-            name
-            if name.isascii()
-            else f"{name} ({name.encode('ascii', 'backslashreplace').decode()})"
-        )
+        text = name
+        if not name.isascii():
+            text += f" ({name.encode('ascii', 'backslashreplace').decode()})"
         near = difflib.get_close_matches(
             name.lower(), [*self.columns, "True", "False"], n=1
         )
@@ -191,27 +181,32 @@ class _Evaluation:
 
     def literal(self, node: ast.expr) -> Any:
         """The text, number or truth value of a literal."""
-        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd):
-            number = self.literal(node.operand)
-            if _kind(number) == NUMBER:
-                return -number if isinstance(node.op, ast.USub) else number
-        if isinstance(node, ast.Constant) and isinstance(node.value, str | int | float):
-            return node.value
-        if isinstance(node, ast.Constant) and node.value is None:
-            raise self.fault(
-                "must write 'is missing' for a missing value",
-                "None",
-                "write, for example: age is missing",
-            )
-        raise self.refused(node)
+        try:
+            value = ast.literal_eval(node)
+        except (ValueError, TypeError):
+            raise self.refused(node) from None
+        if value is None:
+            rule = "must write 'is missing' for a missing value"
+            raise self.fault(rule, "None", "write, for example: age is missing")
+        if not isinstance(value, str | int | float):
+            raise self.refused(node)
+        return value
 
-    def compared(self, op: ast.cmpop, left: Column, right: Column) -> Truth:
+    def compared(self, op: type[ast.cmpop], left: Column, right: Column) -> Truth:
         """Whether each row fulfils one comparison of a chain."""
         if DATE in _kinds(left):
             right = self.dates(right)
         elif DATE in _kinds(right):
             left = self.dates(left)
-        self.require_alike(_kinds(left), _kinds(right), order=type(op) in ORDER)
+        kinds = _kinds(left), _kinds(right)
+        # a column of several kinds has no order
+        has_no_order = op not in (ast.Eq, ast.NotEq) and len(set.union(*kinds)) > 1
+        if has_no_order or (all(kinds) and not set.intersection(*kinds)):
+            raise self.fault(
+                "must compare text with text and numbers with numbers",
+                " beside ".join(" and ".join(sorted(side)) for side in kinds),
+                "put text in quotes, and write numbers without them",
+            )
         return [_compared(op, *pair) for pair in zip(left, right, strict=True)]
 
     def contained(self, left: ast.expr, right: ast.expr) -> Truth:
@@ -220,20 +215,14 @@ class _Evaluation:
         """
         values = self.values(left)
         if isinstance(right, ast.List | ast.Tuple | ast.Set):
-            elements: Column = [self.literal(element) for element in right.elts]
-            if not elements:
-                raise self.fault(
-                    "must have at least one value after 'in'", "an empty list", EXAMPLE
-                )
-            if DATE in _kinds(values):
-                elements = self.dates(elements)
-            for kind in _kinds(elements):
-                self.require_alike(_kinds(values), {kind})
-            keys = {(_kind(element), element) for element in elements}
-            return [
-                None if is_missing(value) else (_kind(value), value) in keys
-                for value in values
+            if not right.elts:
+                rule = "must have at least one value after 'in'"
+                raise self.fault(rule, "an empty list")
+            links = [
+                self.compared(ast.Eq, values, [self.literal(element)] * len(values))
+                for element in right.elts
             ]
+            return _combined(links, decisive=True)
         texts = self.values(right)
         if not _kinds(values) | _kinds(texts) <= {TEXT}:
             raise self.fault(
@@ -246,72 +235,45 @@ class _Evaluation:
             for a, b in zip(values, texts, strict=True)
         ]
 
-    def require_alike(
-        self, left: set[str], right: set[str], *, order: bool = False
-    ) -> None:
-        """Refuse a comparison of two kinds of values; a column of several kinds has no order."""
-        if (order and len(left | right) > 1) or (left and right and not left & right):
-            raise self.fault(
-                "must compare text with text and numbers with numbers",
-                f"{' and '.join(sorted(left))} beside {' and '.join(sorted(right))}",
-                "put text in quotes, and write numbers without them",
-            )
-
     def dates(self, values: Column) -> Column:
-        """Dates from texts, in UTC without a time zone as those of the catalogue."""
-        dates = list[Any]()
-        for value in values:
-            if not isinstance(value, str):
-                dates.append(value)
-                continue
-            try:
-                moment = datetime.fromisoformat(value)
-                dates.append(
-                    moment.astimezone(UTC).replace(tzinfo=None)
-                    if moment.tzinfo
-                    else moment
-                )
-            except (ValueError, OverflowError):
-                raise self.fault(
-                    "must compare a date with a date",
-                    repr(value),
-                    "write it like '2026-11-01'",
-                ) from None
-        return dates
+        """Values with dates in place of texts."""
+        return [self.date(one) if isinstance(one, str) else one for one in values]
+
+    def date(self, text: str) -> datetime:
+        """Date from a text, in UTC without a time zone as those of the catalogue."""
+        try:
+            moment = datetime.fromisoformat(text)
+            if moment.tzinfo:
+                moment = moment.astimezone(UTC).replace(tzinfo=None)
+        except (ValueError, OverflowError):
+            rule = "must compare a date with a date"
+            raise self.fault(rule, repr(text), "write it like '2026-11-01'") from None
+        return moment
 
     def refused(self, node: ast.AST) -> InputError:
         """Error for a part that is not of the language."""
         finding = REFUSED.get(type(node), "another expression")
-        return self.fault(
-            "must compare columns of the catalogue with values", finding, EXAMPLE
-        )
+        return self.fault("must compare columns of the catalogue with values", finding)
 
-    def fault(self, rule: str, finding: str, cure: str) -> InputError:
+    def fault(self, rule: str, finding: str, cure: str = EXAMPLE) -> InputError:
         """Error of this condition."""
-        return input_error(
-            "where", f"a condition {rule}", f"{finding} in {self.text!r}", cure
-        )
+        return _error(rule, f"{finding} in {self.text!r}", cure)
+
+
+def _error(rule: str, finding: str, cure: str) -> InputError:
+    return input_error("where", f"a condition {rule}", finding, cure)
 
 
 def _parsed(text: str) -> tuple[ast.expr, dict[str, str]]:
     """The tree of a condition, and the column by each name that stands for one in backticks."""
     if len(text) > MAX_CHARACTERS:
-        raise input_error(
-            "where",
-            f"a condition must have at most {MAX_CHARACTERS:,} characters",
-            f"{len(text):,}",
-            "select the takes in several steps",
-        )
+        rule = f"must have at most {MAX_CHARACTERS:,} characters"
+        raise _error(rule, f"{len(text):,}", "select the takes in several steps")
     quoted = dict[str, str]()
 
     def name(token: re.Match[str]) -> str:
         if token[3]:
-            raise input_error(
-                "where",
-                "a condition must have no comment",
-                "the character #",
-                "remove it",
-            )
+            raise _error("must have no comment", "the character #", "remove it")
         if token[2] is None:
             return token[0]
         quoted[f"_quoted_{len(quoted)}"] = token[2]
@@ -323,20 +285,18 @@ def _parsed(text: str) -> tuple[ast.expr, dict[str, str]]:
             warnings.simplefilter("error")
             return ast.parse(plain, mode="eval").body, quoted
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
-        raise input_error(
-            "where",
-            "a condition must follow the grammar",
-            f"{text!r} ({error.msg if isinstance(error, SyntaxError) else error})",
-            EXAMPLE,
+        reason = error.msg if isinstance(error, SyntaxError) else error
+        raise _error(
+            "must follow the grammar", f"{text!r} ({reason})", EXAMPLE
         ) from None
 
 
-def _compared(op: ast.cmpop, left: Any, right: Any) -> bool | None:
+def _compared(op: type[ast.cmpop], left: Any, right: Any) -> bool | None:
     if is_missing(left) or is_missing(right):
         return None
     if _kind(left) != _kind(right):  # in a column of text and numbers
-        return isinstance(op, ast.NotEq)
-    return bool(COMPARISONS[type(op)](left, right))
+        return op is ast.NotEq
+    return bool(COMPARISONS[op](left, right))
 
 
 def _negated(truth: Truth) -> Truth:
