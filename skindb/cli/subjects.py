@@ -211,8 +211,8 @@ def _line(result: Refreshed) -> str:
     "--report",
     type=PATH,
     help=(
-        "Name of a report without personal data, which can be handed out. It is "
-        "written as NAME.json and NAME.txt."
+        "Name of a report without personal data, which can be handed out; written as "
+        "NAME.json."
     ),
 )
 @common
@@ -265,7 +265,7 @@ def withdraw(
         for url, count in zip(backups, withdrawal.backups, strict=True)
     ]
     if report is not None:
-        lines += map(str, workflow.write_erasure_report(withdrawal, report))
+        lines.append(str(workflow.write_erasure_report(withdrawal, report)))
     emit(_withdrawal_as_json(withdrawal), lines)
 
 

@@ -13,12 +13,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numcodecs import blosc
-from numpy.typing import NDArray
 from xarray.backends import BackendArray
 from xarray.core import indexing
 from zarr.codecs import BloscCodec, BytesCodec
 
-from skindb.schema.cohort import selected
 from skindb.schema.label import BLOCK_SURFELS
 from skindb.store.place import Place
 from skindb.store.record import Record
@@ -42,30 +40,16 @@ class ShardedArray(BackendArray):
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
         return indexing.explicit_indexing_adapter(
-            key, self.shape, indexing.IndexingSupport.OUTER, self._selected
+            key, self.shape, indexing.IndexingSupport.BASIC, self._selected
         )
 
     def _selected(self, key: tuple[Any, ...]) -> AnyArray:
-        """Values at one slice, index or list of indices along each dim."""
+        """Values at one slice or index along each dim."""
         first, *others = key
-        if isinstance(first, slice) and first.step in (None, 1):
-            begin, end, _ = first.indices(self.shape[0])
-            values = self.rows(begin, max(begin, end))
-        else:
-            values = self._listed(np.atleast_1d(np.arange(self.shape[0])[first]))
-        values = selected(values, (slice(None), *others))
-        return values[0] if isinstance(first, int | np.integer) else values
-
-    def _listed(self, index: NDArray[np.intp]) -> AnyArray:
-        """Values at these indices along the first dim; each chunk is read once."""
-        out = np.empty((len(index), *self.shape[1:]), self.dtype)
-        numbers = index // self.chunk
-        for number in np.unique(numbers).tolist():
-            begin = number * self.chunk
-            values = self.rows(begin, min(begin + self.chunk, self.shape[0]))
-            here = numbers == number
-            out[here] = values[index[here] - begin]
-        return out
+        if not isinstance(first, slice):
+            return self.rows(first, first + 1)[(0, *others)]
+        begin, end, step = first.indices(self.shape[0])
+        return self.rows(begin, max(begin, end))[(slice(None, None, step), *others)]
 
     def rows(self, begin: int, end: int) -> AnyArray:
         """Values from `begin` to `end` along the first dim."""

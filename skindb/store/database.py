@@ -215,10 +215,6 @@ class Database:
         """
         return Snapshot(self.place).history(kind, take)
 
-    def readable_history(self, kind: str, take: str) -> list[Record]:
-        """All readable records, oldest first; damaged ones are skipped."""
-        return Snapshot(self.place).readable_history(kind, take)
-
     def read(
         self,
         kind: str,

@@ -23,7 +23,7 @@ from skindb.errors import InputError, input_error, require
 from skindb.schema.cohort import TAKE, Held, Values, combine, values_of
 from skindb.schema.variables import VARIABLES
 from skindb.store.bucket import place_at
-from skindb.store.entries import block_keys, read_cache
+from skindb.store.entries import read_cache
 from skindb.store.log import RESTORE, committed_logs
 from skindb.store.markers import read_markers
 from skindb.store.place import Place, subject_of
@@ -40,7 +40,6 @@ DIGEST_BYTES = 32  # before the content of a block
 # cached by a process; the tables of a take have some 20 kB, blocks 3 kB for each take
 MAX_OPEN_TABLES = 2048
 MAX_OPEN_BLOCKS = 64
-MAX_LISTED_BLOCKS = 1024  # whose seals a process remembers
 
 
 @dataclass(frozen=True)
@@ -176,25 +175,7 @@ def _opened(block: Block) -> xr.Dataset:
     with suppress(OSError, InputError):
         guard = partial(require_same_markers, place, markers, block.key)
         place.replace(block.key, _packed(block.key, gathered), guard=guard)
-        _remove_parts(block)
     return gathered
-
-
-def _remove_parts(block: Block) -> None:
-    """Remove the blocks all of whose versions this one holds too."""
-    place = block.addresses[0].place
-    seals = {one.seal for one in block.addresses}
-    for key in block_keys(place, GATHERED):
-        if key != block.key and re.fullmatch(BLOCK_KEY, key):
-            held = intact_or_none(partial(_seals, block.addresses[0].url, key))
-            if held is not None and held <= seals:
-                place.remove(key)
-
-
-# names of blocks follow from their seals
-@lru_cache(MAX_LISTED_BLOCKS)
-def _seals(url: str, key: str) -> frozenset[str]:
-    return frozenset(_stored(_place(url), key)[SEAL].values.tolist())
 
 
 def _packed(key: str, block: xr.Dataset) -> bytes:

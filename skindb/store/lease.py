@@ -139,8 +139,6 @@ class Lease:
         self.command = command
         self._clock = clock
         self._held: dict[str, int] = {}  # key -> number of its file
-        # key -> last file of another holder, and when it was first seen
-        self._seen: dict[str, tuple[tuple[int, float], float]] = {}
         self._content = b""
         self._lost: Fault | None = None
         self._ended = threading.Event()
@@ -244,7 +242,7 @@ class Lease:
 
     def _claim(self, key: str) -> Claim | None:
         before = _newest(self.place, key)
-        if before is not None and not self._is_free(before):
+        if before is not None and not _has_ended(self.place, before):
             return before
         number = 1 + (before.number if before else 0)
         try:
@@ -265,24 +263,6 @@ class Lease:
         ):
             self.place.remove(_file_key(key, older))
         return None
-
-    def _is_free(self, claim: Claim) -> bool:
-        """Whether a claim has ended, or this process has seen it unchanged for longer
-        than its duration.
-        """
-        if _has_ended(self.place, claim):
-            return True
-        try:
-            mark = (
-                claim.number,
-                self.place.modified(_file_key(claim.key, claim.number)),
-            )
-            now = _uptime()
-        except FileNotFoundError:  # removed meanwhile: the next attempt decides
-            return False
-        if self._seen.get(claim.key, (None, 0.0))[0] != mark:
-            self._seen[claim.key] = (mark, now)
-        return now - self._seen[claim.key][1] > claim.seconds
 
     def _release(self) -> None:
         """Mark the leases as free, without the holder; their numbers are not reused."""
@@ -323,17 +303,19 @@ def abandoned_holder(place: Place, kind: str, take: str) -> str:
 
 
 def _has_ended(place: Place, claim: Claim) -> bool:
-    """Whether the holder of a claim released it, has ended, or has not renewed it in time."""
+    """Whether the holder of a claim released it, has ended, or has not renewed it in time.
+
+    A file from the future is that of a holder that has not renewed it since the clock of
+    the storage was set back.
+    """
     holder = claim.body.get("holder")
     if claim.is_released or (isinstance(holder, dict) and has_ended(holder)):
         return True
     try:
-        return (
-            storage_time(place) - place.modified(_file_key(claim.key, claim.number))
-            > claim.seconds
-        )
+        written = place.modified(_file_key(claim.key, claim.number))
     except FileNotFoundError:  # removed meanwhile
         return False
+    return abs(storage_time(place) - written) > claim.seconds
 
 
 def storage_time(place: Place) -> float:
@@ -395,11 +377,6 @@ def _lost_fault(key: str, newest: Claim | None) -> Fault:
         finding,
         "nothing was committed; run the command again",
     )
-
-
-def _uptime() -> float:
-    """Seconds since the boot, including those while the machine was suspended."""
-    return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
 def this_process() -> dict[str, Any]:

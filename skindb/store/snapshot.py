@@ -121,11 +121,6 @@ class Snapshot:
         earlier = [log.read(generation) for generation in before]
         return [*filter(self.markers.admits, earlier), current]
 
-    def readable_history(self, kind: str, take: str) -> list[Record]:
-        """All readable records, oldest first; damaged ones are skipped."""
-        records = Log(self.place, kind, take).readable()
-        return [*filter(self.markers.admits, records)]
-
     def subjects(self) -> list[str]:
         """Subjects with a version of any kind."""
         kinds = [kind for kind in self.kinds() if kind not in KINDS_WITHOUT_SUBJECT]

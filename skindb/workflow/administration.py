@@ -373,55 +373,17 @@ def erasure_report(withdrawal: Withdrawal) -> dict[str, Any]:
     return body | {"seal": seal_of(body)}
 
 
-def write_erasure_report(withdrawal: Withdrawal, path: Path) -> list[Path]:
-    """Write a report as JSON and as text, under a path without or with one of the
-    endings .json and .txt.
-    """
-    report = erasure_report(withdrawal)
-    stem = path.with_suffix("") if path.suffix in (".json", ".txt") else path
-    contents = {
-        ".json": json.dumps(report, indent=1),
-        ".txt": "\n".join(_report_lines(report)),
-    }
-    paths = []
-    for ending, content in contents.items():
-        file = stem.with_name(f"{stem.name}{ending}")
-        write_private(file, f"{content}\n".encode())
-        paths.append(file)
-    return paths
+def write_erasure_report(withdrawal: Withdrawal, path: Path) -> Path:
+    """Write a report as JSON, under a path without or with the ending .json."""
+    file = path.with_name(f"{path.name.removesuffix('.json')}.json")
+    content = json.dumps(erasure_report(withdrawal), indent=1)
+    write_private(file, f"{content}\n".encode())
+    return file
 
 
 def _is_erased(db: Database, subject: str) -> bool:
     """Whether a subject was withdrawn, and nothing of any withdrawn subject is left."""
     return db.markers().is_withdrawn(subject) and not db.has_remains()
-
-
-def _report_lines(report: dict[str, Any]) -> list[str]:
-    counts = {
-        "Removed versions": report["removed_versions"],
-        "Computed again without the subject": report["computed_again"],
-        "Waiting to be computed again (skindb refresh)": report["waiting_for_refresh"],
-    }
-    lines = [
-        "Erasure of one subject from a skindb database",
-        "",
-        f"Completed: {report['completed']}",
-        f"Software: skindb {report['software_version']}",
-    ]
-    for title, numbers in counts.items():
-        parts = [f"{number} of kind {kind}" for kind, number in numbers.items()]
-        lines.append(f"{title}: {', '.join(parts) or 'none'}")
-    lines += [
-        f"Releases with a new revision: {report['revised_releases']}",
-        f"Results for which no other take was used: {report['results_without_other_takes']}",
-        f"Backups from which the subject was erased: {report['erased_backups']}",
-        "",
-        "The erasure does not reach:",
-        *(f"- {place}" for place in report["not_reached"]),
-        "",
-        f"Seal (SHA-256 of the report): {report['seal']}",
-    ]
-    return lines
 
 
 def _count(number: int) -> str:

@@ -92,21 +92,6 @@ def edit(
     return db.read("edit", take, generation=record.generation)
 
 
-def stored_or_moved(
-    db: Database, take: str, source: Editable, amounts: Mapping[str, float]
-) -> xr.DataTree:
-    """The model moved along traits: an edit of the database that was made from the same
-    versions, or a new one.
-
-    Nothing is committed.
-    """
-    derivation = source.derivation_by(amounts)
-    for record in reversed(db.readable_history("edit", take)):
-        if derivation.describes(record):
-            return db.read("edit", take, generation=record.generation)
-    return source.move(amounts)
-
-
 @logged("render")
 def edit_grid(
     db: Database,

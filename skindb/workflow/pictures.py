@@ -37,7 +37,7 @@ from skindb.view.page import (
     write_page,
 )
 from skindb.workflow.audit import logged
-from skindb.workflow.edits import editable_model, stored_or_moved
+from skindb.workflow.edits import editable_model
 
 SIDE_PX = 320  # of a picture
 CLOSE_MM = 40.0  # side of a close-up
@@ -530,13 +530,10 @@ def _moved(
     if not traits:
         return model, ()
     source = editable_model(db, take, study, dictionary)
-    plain = stored_or_moved(db, take, source, dict.fromkeys(traits, 0.0))
+    plain = source.move(dict.fromkeys(traits, 0.0))
     moved = []
     for name, amount in traits.items():
-        full, half = (
-            stored_or_moved(db, take, source, {name: part * amount})
-            for part in (1.0, 0.5)
-        )
+        full, half = (source.move({name: part * amount}) for part in (1.0, 0.5))
         moved.append(Trait(name, full, half, amount))
     return plain, tuple(moved)
 

@@ -288,9 +288,6 @@ def test_late_commit__is_not_visible(late):
     [block] = late.place.children("catalogue")
     assert SUBJECT.encode() not in late.place.read(f"catalogue/{block}")
     assert not late.has("capture", f"{SUBJECT}.lotion")
-    assert [
-        record.generation for record in late.readable_history("population", "traits")
-    ] == [1]
 
 
 def test_late_commit__is_named_by_verify_and_removed_by_clean(late):

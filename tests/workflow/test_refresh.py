@@ -14,7 +14,7 @@ from planted_population import TABLES, population
 from skindb import workflow
 from skindb.errors import InputError
 from skindb.store import Database, StaleWarning, require_fresh, stale_versions
-from skindb.workflow import edits, studies
+from skindb.workflow import studies
 
 pytestmark = pytest.mark.slow
 
@@ -118,23 +118,6 @@ def test_edit__names_the_studies_there_are(db):
         ),
     ):
         workflow.edit(db, "B", {"lotion": 0.5}, study="traits.k-9")
-
-
-def test_stored_or_moved__reads_an_edit_only_if_it_was_made_from_the_same_versions(db):
-    def moved(**amounts):
-        source = edits.editable_model(db, "B", "traits.three", None)
-        return edits.stored_or_moved(db, "B", source, amounts)
-
-    assert moved(lotion=0.5).attrs["generation"] == 1
-    np.testing.assert_array_equal(
-        moved(lotion=0.5)["fitted/basis_weight"],
-        db.read("edit", "B")["fitted/basis_weight"],
-    )
-    assert "command" not in moved(lotion=0.25).attrs  # computed, and not committed
-    assert len(db.history("edit", "B")) == 1
-    _commit(db, "B")
-    workflow.refresh(db)
-    assert moved(lotion=0.5).attrs["generation"] == 2
 
 
 def test_stale_versions__a_new_model_supersedes_what_was_made_from_the_old_one(db):

@@ -468,7 +468,7 @@ def test_withdraw_command__writes_a_report_without_personal_data(db, tmp_path):
         "A",
         "--yes",
         "--report",
-        str(tmp_path / "erasure.txt"),
+        str(tmp_path / "erasure.json"),
     ]
     result = CliRunner().invoke(cli, arguments)
     assert result.exit_code == 0, result.output
@@ -478,7 +478,6 @@ def test_withdraw_command__writes_a_report_without_personal_data(db, tmp_path):
         in result.stdout
     )
     report = json.loads((tmp_path / "erasure.json").read_text())
-    text = (tmp_path / "erasure.txt").read_text()
     assert report["removed_versions"] == {
         "edit": 1,
         "model": 4,
@@ -489,11 +488,9 @@ def test_withdraw_command__writes_a_report_without_personal_data(db, tmp_path):
     assert report["computed_again"] == {"population": 3}
     assert report["waiting_for_refresh"] == {"edit": 1}
     assert report["revised_releases"] == 1
-    assert "4 of kind model" in text
-    assert "- capture folders" in text
+    assert "capture folders" in report["not_reached"]
     seal = report.pop("seal")
     assert seal == seal_of(report)
-    assert seal in text
     words = {
         "A",
         "B",
@@ -504,10 +501,8 @@ def test_withdraw_command__writes_a_report_without_personal_data(db, tmp_path):
         str(tmp_path),
         str(db.root),
     }
-    for content in (json.dumps(report), text):
-        assert not words & set(re.findall(r"[\w./-]+", content))
-    for file in ("erasure.json", "erasure.txt"):
-        assert (tmp_path / file).stat().st_mode & 0o777 == 0o600
+    assert not words & set(re.findall(r"[\w./-]+", json.dumps(report)))
+    assert (tmp_path / "erasure.json").stat().st_mode & 0o777 == 0o600
 
 
 def test_withdraw_command__refuses_a_report_in_a_missing_folder_before_anything_is_removed(
