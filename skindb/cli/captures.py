@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -154,14 +153,6 @@ def _simulated(simulated: tuple[int, Path]) -> tuple[str, Any, list[str]]:
     help="Distance from a landmark within which the scan is kept, in mm.",
 )
 @click.option(
-    "--new-consent",
-    type=click.DateTime(["%Y-%m-%d"]),
-    help=(
-        "Date on which a subject who was withdrawn consented again. Only one capture "
-        "can be given with it."
-    ),
-)
-@click.option(
     "--again",
     is_flag=True,
     help="Also ingest captures of which the newest version would not change.",
@@ -180,7 +171,6 @@ def ingest(
     captures: tuple[Path, ...],
     crop_box: tuple[float, float, float, float, float, float] | None,
     crop_reach: float | None,
-    new_consent: datetime | None,
     again: bool,
     explain: bool,
     wait: float,
@@ -194,15 +184,8 @@ def ingest(
     does not stop the others. An interrupted ingest leaves no incomplete version, and
     the same command resumes it. Nothing is done if the newest version was made of the
     same files, with the same parameters, by the same code. A capture of a subject who
-    was withdrawn is refused, unless --new-consent states a new consent.
+    was withdrawn is refused.
     """
-    if new_consent is not None and len(captures) > 1:
-        raise input_error(
-            "--new-consent",
-            "a new consent is stated for one capture",
-            f"{len(captures)} captures",
-            "ingest one capture with it, and then the others",
-        )
     low, high = (crop_box[:3], crop_box[3:]) if crop_box else (None, None)
     crop = skindb.ingest.Crop(low, high, crop_reach) if crop_box or crop_reach else None
     progress = bar()
@@ -212,7 +195,6 @@ def ingest(
         database,
         again=again,
         crop=crop,
-        new_consent=None if new_consent is None else new_consent.date(),
         wait=wait,
         progress=progress,
         **asdict(parameters),

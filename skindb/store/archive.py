@@ -28,10 +28,10 @@ from skindb.store.markers import (
     ENTRY,
     WITHDRAWN,
     Markers,
-    entry_numbers,
     marker_faults,
     read_markers,
     require_secret,
+    withdrawn_hashes,
 )
 from skindb.store.place import KIND, TAKE, TIME_HEX, Place, UnavailableError
 from skindb.store.record import (
@@ -256,7 +256,7 @@ class Archive:
         """
 
         def check() -> None:
-            if entry_numbers(self.place.sizes(WITHDRAWN)) != markers.numbers:
+            if withdrawn_hashes(self.place.sizes(WITHDRAWN)) != markers.hashes:
                 raise Changed
 
         return check
@@ -388,7 +388,7 @@ def items_of(record: Record, manifest: Manifest) -> list[Item]:
 
 def seal_of_withdrawals(markers: Markers) -> str:
     """Seal of the withdrawals at one moment."""
-    return seal_of(markers.numbers)
+    return seal_of({WITHDRAWN: sorted(markers.hashes)})
 
 
 def surviving(

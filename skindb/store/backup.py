@@ -375,8 +375,7 @@ def _require_unchanged(
     """Raise `Changed` if a subject was withdrawn since a list, or a version removed
     that may be the cause of faults.
     """
-    present = read_markers(place).numbers
-    if any(number > markers.numbers.get(name, 0) for name, number in present.items()):
+    if not read_markers(place).hashes <= markers.hashes:
         raise Changed
     tombstones = {f"tombstones/{name}" for name in place.children("tombstones")}
     if faults and not tombstones <= listing.keys():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -43,14 +42,7 @@ from skindb.store.erasure import (
 from skindb.store.garbage import Garbage, find_garbage, remove_garbage
 from skindb.store.lease import LEASE_SECONDS, Lease
 from skindb.store.log import Log
-from skindb.store.markers import (
-    Entry,
-    Markers,
-    last_entry,
-    note_withdrawals,
-    read_markers,
-    readmit,
-)
+from skindb.store.markers import Markers, read_markers, read_withdrawal
 from skindb.store.place import subject_of
 from skindb.store.record import Record
 from skindb.store.snapshot import (
@@ -537,30 +529,11 @@ class Database:
         """Whether data of a withdrawn subject are left, which `complete_erasures` removes."""
         return bool(holdings_of(self.place, self.markers()))
 
-    def withdrawal(self, subject: str) -> Entry | None:
-        """The last withdrawal or readmission of a subject; None if the subject was
-        never withdrawn.
+    def withdrawal(self, subject: str) -> dict[str, Any] | None:
+        """When a subject was withdrawn, and the numbers of removed versions; None if the
+        subject is not withdrawn.
         """
-        return last_entry(self.place, subject)
-
-    def readmit(self, subject: str, consent: date) -> None:
-        """Admit a withdrawn subject again, by the date of a new consent.
-
-        Raises
-        ------
-        InputError
-            If the subject was never withdrawn, if the date is before the withdrawal or
-            in the future, or if data of the subject remain.
-        """
-        require(
-            not self.has_remains(),
-            subject,
-            "a withdrawal must be complete before the subject is admitted again",
-            "data that are not removed yet",
-            "run skindb clean --yes",
-        )
-        readmit(self.place, subject, consent)
-        note_withdrawals(self.place)
+        return read_withdrawal(self.place, subject)
 
     def requests(self) -> list[Request]:
         """Results that withdrawals removed and that are to be computed again."""

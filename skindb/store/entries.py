@@ -26,7 +26,7 @@ CATALOGUE = "catalogue"
 # of databases that were made before the first release; names every subject
 EARLIER_CATALOGUE = "catalogue.json"
 CATALOGUE_BLOCK = r"[0-9a-f]{64}\.json"
-BLOCK_FORMAT = 5
+BLOCK_FORMAT = 6
 # a withdrawal removes the blocks with its subject, whose other rows are read again
 MAX_BLOCK_ROWS = 2048
 # a block of at most this many times the new rows is merged with them
@@ -69,7 +69,6 @@ CACHED_FIELDS = (
     "path",
     "created",
     "bytes",
-    "admissions",
     "seal",
 )
 T = TypeVar("T")

@@ -114,7 +114,7 @@ def holdings_of(place: Place, markers: Markers) -> Holdings:
     """What a database holds of the subjects that these entries declare withdrawn;
     nothing is read if there are none.
     """
-    if not markers.numbers:
+    if not markers.hashes:
         return Holdings()
     records = _every_record(place)
     doomed = _doomed(records, markers)
@@ -240,7 +240,7 @@ def erase_withdrawn(place: Place) -> Erasure:
     """
     erasure = Erasure()
     markers = read_markers(place)
-    while markers.numbers:
+    while markers.hashes:
         place.sweep()  # before anything is listed, see `markers`
         _erase_holdings(place, holdings_of(place, markers), markers, erasure)
         later = read_markers(place)
@@ -249,7 +249,7 @@ def erase_withdrawn(place: Place) -> Erasure:
         if later == markers:
             break
         markers = later
-    if markers.numbers:
+    if markers.hashes:
         note_withdrawals(place)  # again, because there may be more space
     return erasure
 
@@ -465,8 +465,7 @@ def _is_admitted(place: Place, markers: Markers, path: str, subjects: set[str]) 
     names = read_names(place, path)
     if names is None:
         return False
-    takes, admissions = names
-    return markers.admits_all(subjects.union(map(subject_of, takes)), admissions)
+    return not any(map(markers.is_withdrawn, subjects.union(map(subject_of, names))))
 
 
 def _scratch(place: Place, markers: Markers) -> Iterator[Path]:

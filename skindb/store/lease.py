@@ -27,7 +27,7 @@ from typing import Any, Self
 
 from skindb.clock import SYSTEM_CLOCK, Clock
 from skindb.errors import Fault, InputError
-from skindb.store.markers import AdmissionGuard, WithdrawnError
+from skindb.store.markers import WithdrawalGuard, WithdrawnError
 from skindb.store.place import (
     KIND,
     KINDS_WITHOUT_SUBJECT,
@@ -144,13 +144,13 @@ class Lease:
         self._ended = threading.Event()
         self._turn = threading.Lock()
         of_subject = {*kinds} - {*KINDS_WITHOUT_SUBJECT}
-        self._subjects = [subject_of(take)] if of_subject else []
-        self._guard = AdmissionGuard(place, {})
+        subjects = {subject_of(take)} if of_subject else set()
+        self._guard = WithdrawalGuard(place, frozenset(subjects))
 
     def __enter__(self) -> Self:
         end = self._clock.monotonic() + self.wait
         self._ended.clear()
-        self._guard = AdmissionGuard.begin(self.place, self._subjects)
+        self._guard()
         try:
             while (holder := self._claim_all()) is not None:
                 if (remaining := end - self._clock.monotonic()) <= 0:

@@ -135,7 +135,7 @@ class Log:
         record
             Record without a seal.
         guard
-            The last check before the record exists; see `AdmissionGuard`.
+            The last check before the record exists; see `WithdrawalGuard`.
 
         Raises
         ------

@@ -1,16 +1,14 @@
-"""Withdrawals and readmissions of subjects, which are kept for good and without pseudonyms.
+"""Withdrawals of subjects, which are kept for good and without pseudonyms.
 
-`withdrawn/<hash>/<number>.json` is an entry. Odd entries state that the subject was
-withdrawn, even ones that the subject was admitted again with a new, dated consent. The
-hash is that of the pseudonym, keyed with the random bytes in `secret`. The number of
-the last entry of a subject is its *admission*; without entries it is 0. A version
-records the admissions of the subjects that it refers to, and only readers for whom they
-are the same see it.
+`withdrawn/<hash>.json` is an entry, which states that a subject was withdrawn. The hash
+is that of the pseudonym, keyed with the random bytes in `secret`. A withdrawn subject
+never comes back: who consents again gets a new pseudonym. No reader sees a version that
+refers to a withdrawn subject.
 
 No writer can bring a withdrawn subject back, although writers hold no locks and may be
 suspended at any time. In a folder, a record appears in three steps: the writer (W1)
-writes a temporary file in `staging/`, (W2) lists the entries and refuses if an
-admission has changed, and (W3) links the temporary file to the name of the record. A
+writes a temporary file in `staging/`, (W2) lists the entries and refuses if a
+subject is withdrawn, and (W3) links the temporary file to the name of the record. A
 withdrawal (E1) creates its entry, (E2) removes every file in `staging/`, and (E3) lists
 and removes what refers to the subject. If W2 comes after E1, the writer sees the entry
 and refuses. If W2 comes before E1, the temporary file exists before E2 removes it:
@@ -19,10 +17,10 @@ removed although its subjects are not withdrawn starts again at W1.
 
 In a bucket, W1 and W3 are one conditional put, and the writer repeats W2 afterwards. If
 it refuses then, it removes its record. If it is killed before, readers ignore the
-record, because its admissions differ, and `skindb clean` removes it.
+record, and `skindb clean` removes it.
 
-The *marker file* is a local file outside the database that notes withdrawals,
-readmissions and consents. A restore of an earlier backup repeats what the file notes.
+The *marker file* is a local file outside the database that notes withdrawals and
+consents. A restore of an earlier backup repeats what the file notes.
 Each line is a JSON object with a seal that is keyed by the secret of the database.
 Subjects are named by keyed hashes only. Lines are only added; what is missing, for
 example after a full disk, is added by the next command that writes to the file.
@@ -42,7 +40,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from datetime import UTC, date, datetime
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -52,7 +50,6 @@ from skindb.errors import (
     InputError,
     SkindbWarning,
     input_error,
-    require,
     system_fault,
 )
 from skindb.files import PRIVATE_FILE, make_private, read_regular
@@ -75,7 +72,7 @@ from skindb.store.record import (
 SECRET = "secret"
 SECRET_BYTES = 32
 WITHDRAWN = "withdrawn"
-ENTRY = re.compile(r"([0-9a-f]{64})/([0-9]{4})\.json")
+ENTRY = re.compile(r"([0-9a-f]{64})\.json")
 RESTORE_SECRET = "restore it from a backup"
 RESTORING = "restoring.json"
 BACKUP = "backup.json"
@@ -98,120 +95,49 @@ class WithdrawnError(InputError):
 
 
 @dataclass(frozen=True)
-class Entry:
-    """An entry of a subject: a withdrawal, or the date of a new consent."""
-
-    number: int
-    body: Mapping[str, Any]
-
-    @property
-    def is_withdrawal(self) -> bool:
-        """Whether the subject is withdrawn."""
-        return self.number % 2 == 1
-
-    @property
-    def date(self) -> date:
-        """Date of the withdrawal in the time zone of this machine, or date of the new consent."""
-        if self.is_withdrawal:
-            return datetime.fromisoformat(self.body["withdrawn"]).astimezone().date()
-        return date.fromisoformat(self.body["readmitted"])
-
-
-@dataclass(frozen=True)
 class Markers:
-    """The admissions of all subjects at one moment."""
+    """The withdrawn subjects at one moment."""
 
-    numbers: Mapping[str, int]  # keyed hash of a subject -> number of its last entry
+    hashes: frozenset[str]  # keyed hashes of the subjects
     secret: bytes = field(repr=False)
-
-    def admission(self, subject: str) -> int:
-        """Number of the last entry of a subject, which is odd while the subject is withdrawn."""
-        if not self.numbers:
-            return 0
-        return self.numbers.get(keyed_hash(self.secret, subject), 0)
 
     def is_withdrawn(self, subject: str) -> bool:
         """Whether a subject is withdrawn."""
-        return self.admission(subject) % 2 == 1
+        return bool(self.hashes) and keyed_hash(self.secret, subject) in self.hashes
 
     def with_withdrawn(self, subject: str) -> Markers:
-        """The admissions if a subject were withdrawn too."""
-        number = self.admission(subject)
-        return Markers(
-            {**self.numbers, keyed_hash(self.secret, subject): number + 1 - number % 2},
-            self.secret,
-        )
+        """The withdrawals if a subject were withdrawn too."""
+        return replace(self, hashes=self.hashes | {keyed_hash(self.secret, subject)})
 
     def hides(self, kind: str, take: str) -> bool:
         """Whether the versions of a kind of a take are those of a withdrawn subject."""
-        subjects = subjects_of(kind, take, ()) if self.numbers else ()
-        return any(map(self.is_withdrawn, subjects))
+        return any(map(self.is_withdrawn, subjects_of(kind, take, ())))
 
     def admits(self, record: Record) -> bool:
-        """Whether no subject of a version was withdrawn since it was begun."""
+        """Whether no subject of a version is withdrawn."""
         # most databases have no withdrawals, and many records
-        subjects = record.subjects if self.numbers else ()
-        return self.admits_all(subjects, record.admissions)
-
-    def admits_all(
-        self, subjects: Iterable[str], admissions: Mapping[str, int]
-    ) -> bool:
-        """Whether no subject is withdrawn, and the admissions of all of them are the given ones."""
-        if not self.numbers:
-            return True
-        return all(
-            not self.is_withdrawn(subject)
-            and self.admission(subject) == admissions.get(subject, 0)
-            for subject in subjects
-        )
+        return not self.hashes or not any(map(self.is_withdrawn, record.subjects))
 
 
 @dataclass(frozen=True)
-class AdmissionGuard:
-    """The last check before a file of these subjects is created: raises if an admission
-    has changed meanwhile.
-
-    Parameters
-    ----------
-    place
-        Location of the database.
-    admissions
-        Subject -> admission when the writer began.
+class WithdrawalGuard:
+    """The check when a writer begins, and the last one before a file of its subjects is
+    created: raises if one is withdrawn.
     """
 
     place: Place
-    admissions: Mapping[str, int]
-
-    @classmethod
-    def begin(cls, place: Place, subjects: Iterable[str]) -> AdmissionGuard:
-        """The guard of a writer that begins; `WithdrawnError` if one of the subjects is
-        withdrawn.
-        """
-        markers = read_markers(place)
-        guard = cls(
-            place, {subject: markers.admission(subject) for subject in subjects}
-        )
-        guard._require(markers)
-        return guard
+    subjects: frozenset[str]
 
     def __call__(self) -> None:
-        """Raise a `WithdrawnError` if one of the subjects was withdrawn since the writer began."""
-        self._require(read_markers(self.place))
-
-    def _require(self, markers: Markers) -> None:
+        """Raise a `WithdrawnError` if one of the subjects is withdrawn."""
+        withdrawn = filter(read_markers(self.place).is_withdrawn, self.subjects)
         rule = (
             "the subject must not be withdrawn while a version with its data is written"
         )
         cure = "nothing was committed; run the command again without the subject"
-        withdrawn = [
-            subject
-            for subject in self.admissions
-            if not markers.admits_all([subject], self.admissions)
-        ]
-        if withdrawn:
-            raise WithdrawnError(
-                Fault(subject, rule, "a withdrawal", cure) for subject in withdrawn
-            )
+        faults = [Fault(one, rule, "a withdrawal", cure) for one in withdrawn]
+        if faults:
+            raise WithdrawnError(faults)
 
 
 def subject_hash(place: Place, subject: str) -> str:
@@ -227,7 +153,7 @@ def require_secret(place: Place) -> bytes:
     """
     if (
         not place.file_type(SECRET)
-        and not _numbers(place)
+        and not _hashes(place)
         and not place.file_type(AUDIT)
     ):
         place.create(SECRET, sealed({"secret": os.urandom(SECRET_BYTES).hex()}))
@@ -237,122 +163,60 @@ def require_secret(place: Place) -> bytes:
 
 
 def read_markers(place: Place) -> Markers:
-    """The admissions of all subjects, from one list."""
-    numbers = _numbers(place)
-    return Markers(numbers, require_secret(place) if numbers else b"")
+    """The withdrawn subjects, from one list."""
+    hashes = _hashes(place)
+    return Markers(hashes, require_secret(place) if hashes else b"")
 
 
-def last_entry(place: Place, subject: str) -> Entry | None:
-    """The last entry of a subject; None if the subject was never withdrawn."""
+def read_withdrawal(place: Place, subject: str) -> dict[str, Any] | None:
+    """The entry of a subject: time, and number of removed versions of each kind; None if
+    the subject is not withdrawn.
+    """
     markers = read_markers(place)
-    number = markers.admission(subject)
-    if not number:
+    if not markers.is_withdrawn(subject):
         return None
-    key = _entry_key(markers.secret, subject, number)
-    return Entry(number, _read_entry(place, markers.secret, key))
+    name = keyed_hash(markers.secret, subject)
+    return _read_entry(place, markers.secret, f"{WITHDRAWN}/{name}.json")
 
 
 def mark_withdrawn(place: Place, subject: str, removed: Mapping[str, int]) -> None:
     """Create the entry of a withdrawal, with the number of versions of each kind,
     unless the subject is withdrawn.
     """
-    admission = read_markers(place).admission(subject)
-    if admission % 2 == 0:
-        now = datetime.now(UTC).isoformat(timespec="seconds")
-        _create_entry(
-            place, subject, admission + 1, {"withdrawn": now, "removed": dict(removed)}
-        )
-
-
-def readmit(place: Place, subject: str, consent: date) -> None:
-    """Admit a withdrawn subject again, by the date of a new consent.
-
-    Raises
-    ------
-    InputError
-        If the subject was never withdrawn, or if the date is before the withdrawal or
-        in the future.
-    """
-    entry = last_entry(place, subject)
-    if entry is None:
-        raise input_error(
-            subject,
-            "a new consent is only for a subject who was withdrawn",
-            "no withdrawal",
-            "run the command without it",
-        )
-    if not entry.is_withdrawal:
-        if entry.date == consent:  # the run that admitted the subject was interrupted
-            return
-        raise input_error(
-            subject,
-            "a subject is admitted again once",
-            f"the new consent of {entry.date}",
-            "run the command without it",
-        )
-    require(
-        entry.date <= consent <= date.today(),
-        subject,
-        "a new consent must be given after the withdrawal of the subject, and not in the future",
-        f"{consent}, and a withdrawal on {entry.date}",
-        "state the date on which the subject signed it",
-    )
-    if not _create_entry(
-        place, subject, entry.number + 1, {"readmitted": consent.isoformat()}
-    ):
-        # another process was faster, perhaps with another date
-        readmit(place, subject, consent)
+    secret = require_secret(place)
+    key = f"{WITHDRAWN}/{keyed_hash(secret, subject)}.json"
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    body = {"withdrawn": now, "removed": dict(removed)}
+    content = json.dumps({**body, "seal": keyed_seal(secret, key, body)})
+    place.create(key, content.encode())
 
 
 def marker_faults(place: Place) -> list[Fault]:
     """Faults of the secret and of the entries."""
-    numbers = _numbers(place)
-    if not numbers and not place.file_type(SECRET):
+    hashes = _hashes(place)
+    if not hashes and not place.file_type(SECRET):
         return []
     faults: list[Fault] = []
     secret = collect_faults(partial(require_secret, place), faults)
-    if secret is None:
-        return faults
-    for name, newest in sorted(numbers.items()):
-        for number in range(1, newest + 1):
-            key = f"{WITHDRAWN}/{name}/{number:04d}.json"
+    if secret is not None:
+        for name in sorted(hashes):
+            key = f"{WITHDRAWN}/{name}.json"
             collect_faults(partial(_read_entry, place, secret, key), faults)
     return faults
 
 
-def _numbers(place: Place) -> dict[str, int]:
-    """Keyed hash of every subject that was ever withdrawn -> number of the last entry."""
+def _hashes(place: Place) -> frozenset[str]:
+    """Keyed hash of every subject that was withdrawn."""
     names = place.sizes(WITHDRAWN)
     for name, (finding, cure) in LOCKS.items():
         if name in names and not place.is_unlocked:
             raise input_error(place.name, "must be a complete database", finding, cure)
-    return entry_numbers(names)
+    return withdrawn_hashes(names)
 
 
-def entry_numbers(names: Iterable[str]) -> dict[str, int]:
-    """Number of the last entry of every subject, by the keyed hash, from the names of
-    the entries.
-    """
-    numbers: dict[str, int] = {}
-    for name in names:
-        match = ENTRY.fullmatch(name)
-        if match:
-            numbers[match[1]] = max(int(match[2]), numbers.get(match[1], 0))
-    return numbers
-
-
-def _create_entry(
-    place: Place, subject: str, number: int, body: Mapping[str, Any]
-) -> bool:
-    secret = require_secret(place)
-    key = _entry_key(secret, subject, number)
-    return place.create(
-        key, json.dumps({**body, "seal": keyed_seal(secret, key, body)}).encode()
-    )
-
-
-def _entry_key(secret: bytes, subject: str, number: int) -> str:
-    return f"{WITHDRAWN}/{keyed_hash(secret, subject)}/{number:04d}.json"
+def withdrawn_hashes(names: Iterable[str]) -> frozenset[str]:
+    """Keyed hash of every subject that was withdrawn, from the names of the entries."""
+    return frozenset(match[1] for name in names if (match := ENTRY.fullmatch(name)))
 
 
 def is_sealed(secret: bytes, key: str, body: Mapping[str, Any]) -> bool:
@@ -429,8 +293,8 @@ def _notes_from(content: bytes, location: str, secret: bytes) -> Notes:
 
 
 def note_withdrawals(place: Place, *, is_repeated: bool = False) -> None:
-    """Add the withdrawals and readmissions of a database to its marker file, which is
-    created if it is missing.
+    """Add the withdrawals of a database to its marker file, which is created if it is
+    missing.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ from skindb.store.place import (
 T = TypeVar("T")
 # what reading or parsing a damaged file raises
 DAMAGE = (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError)
-FORMAT = 3
+FORMAT = 4
 FIELDS = {
     "format",
     "kind",
@@ -41,7 +41,6 @@ FIELDS = {
     "bytes",
     "provenance",
     "names",
-    "admissions",
     "manifest",
     "tables",
     "contents",
@@ -139,8 +138,6 @@ class Record:
     provenance: dict[str, Any] = field(repr=False)
     # takes that the version refers to, directly or through its inputs, without its own
     names: tuple[str, ...] = field(default=(), repr=False)
-    # subject that was withdrawn and admitted again -> its admission, see `markers`
-    admissions: dict[str, int] = field(default_factory=dict, repr=False)
     manifest: str = ""  # sha256 of the manifest
     tables: str = ""  # sha256 of the tables, if the version has any
     # group -> sizes, variables and short labels
@@ -371,7 +368,6 @@ CHECKS: dict[str, Test] = {
     "created": _is_text,
     "bytes": _is_count,
     "names": partial(_is_list_of, lambda name: _is_text(name, TAKE)),
-    "admissions": partial(_is_object_of, _is_count),
     "provenance": _is_provenance,
     "manifest": lambda value: _is_text(value, DIGEST),
     "tables": _is_digest_or_empty,

@@ -32,12 +32,12 @@ from skindb.store.markers import (
     WITHDRAWN,
     Markers,
     Notes,
-    entry_numbers,
     keyed_hash,
     note_consents,
     note_withdrawals,
     read_marker_file,
     require_secret,
+    withdrawn_hashes,
 )
 from skindb.store.place import RELEASE, STAGING, Place
 from skindb.store.record import Record, subjects_of
@@ -173,8 +173,8 @@ def _plan(archive: Archive, state: State, notes: Notes) -> Plan:
         for key, body in notes.entries.items()
         if key not in entries
     }
-    numbers = entry_numbers(key.removeprefix(f"{WITHDRAWN}/") for key in entries)
-    markers = Markers(numbers, require_secret(archive.place))
+    hashes = withdrawn_hashes(key.removeprefix(f"{WITHDRAWN}/") for key in entries)
+    markers = Markers(hashes, require_secret(archive.place))
     faults: list[Fault] = []
     stored = archive.records(state, faults)
     tombstones = [key for key in state.files if key.startswith("tombstones/")]

@@ -31,7 +31,7 @@ from skindb.store.inputs import (
 )
 from skindb.store.lease import Lease
 from skindb.store.log import Log
-from skindb.store.markers import AdmissionGuard, read_markers, require_secret
+from skindb.store.markers import WithdrawalGuard, read_markers, require_secret
 from skindb.store.place import (
     GROUP,
     KINDS_OF_ONE_SUBJECT,
@@ -103,7 +103,9 @@ class Stage:
         self.names = sorted(
             {require_text(name, TAKE, "take") for name in names} - own_takes(kind, take)
         )
-        self._guard = AdmissionGuard.begin(place, subjects_of(kind, take, self.names))
+        subjects = frozenset(subjects_of(kind, take, self.names))
+        self._guard = WithdrawalGuard(place, subjects)
+        self._guard()
         now = datetime.now(UTC)
         self.created = now.isoformat(timespec="seconds")
         self.path = (
@@ -232,7 +234,6 @@ class Stage:
             bytes=sum(file.size for file in files.values()),
             provenance=attrs,
             names=tuple(names),
-            admissions=self._admissions(),
             contents=self.contents,
             previous=self.previous,
         )
@@ -319,20 +320,12 @@ class Stage:
                 f"call db.stage({kind!r}, {take!r}, names=[...])",
             )
 
-    def _admissions(self) -> dict[str, int]:
-        """Admissions of the subjects that were withdrawn and admitted again."""
-        return {
-            subject: number
-            for subject, number in self._guard.admissions.items()
-            if number
-        }
-
     def _declare(self) -> None:
         """Write which takes the version refers to, before anything else."""
         if not self._is_declared:
             key = f"{self.path.removesuffix('.zarr')}.{NAMES}.json"
-            content = {"names": self.names, "admissions": self._admissions()}
-            self.place.create(key, json.dumps(content).encode(), guard=self._guard)
+            content = json.dumps({"names": self.names}).encode()
+            self.place.create(key, content, guard=self._guard)
             self._is_declared = True
 
     def _discard(self) -> None:
@@ -370,17 +363,13 @@ class Stage:
             return True
 
 
-def read_names(place: Place, path: str) -> tuple[list[str], dict[str, int]] | None:
-    """Takes that a version refers to and admissions of their subjects, from beside it;
-    None if they are unknown.
-    """
+def read_names(place: Place, path: str) -> list[str] | None:
+    """Takes that a version refers to, from beside it; None if they are unknown."""
 
-    def read() -> tuple[list[str], dict[str, int]]:
+    def read() -> list[str]:
         key = f"{path.removesuffix('.zarr')}.{NAMES}.json"
-        content = json_object(place.read_small(key))
-        names = [require_text(name, TAKE, "take") for name in content["names"]]
-        admissions = content["admissions"].items()
-        return names, {str(subject): int(number) for subject, number in admissions}
+        names = json_object(place.read_small(key))["names"]
+        return [require_text(name, TAKE, "take") for name in names]
 
     return intact_or_none(read)
 

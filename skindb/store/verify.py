@@ -51,7 +51,7 @@ LAYOUT = {
     "data": (KIND, TAKE, rf"{TIME_HEX}\.(zarr|(manifest|tables|names)\.json)"),
     "leases": (KIND, TAKE, NUMBER.pattern),
     STAGING: (r"\.[0-9a-f]{32}\.tmp",),
-    WITHDRAWN: (r"[0-9a-f]{64}", r"[0-9]{4}\.json"),
+    WITHDRAWN: (r"[0-9a-f]{64}\.json",),
     AUDIT: (BLOCK_NAME, ENTRY_NAME),
     REQUESTS: (REQUEST_NAME,),
     GATHERED: (GATHERED_NAME,),
@@ -316,11 +316,7 @@ def _record_faults(place: Place, record: Record, tables: bytes) -> list[Fault]:
     root = json_object(place.read_small(f"{record.path}/zarr.json"))
     wrong = [] if root.get("attributes") == record.provenance else ["provenance"]
     if record.kind not in KINDS_OF_ONE_SUBJECT:
-        wrong += (
-            []
-            if read_names(place, record.path) == ([*record.names], record.admissions)
-            else ["names"]
-        )
+        wrong += [] if read_names(place, record.path) == [*record.names] else ["names"]
     contents = {
         str(name): describe(node.to_dataset()) for name, node in tree.children.items()
     }

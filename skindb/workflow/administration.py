@@ -253,8 +253,8 @@ def plan_withdrawal(
     entry = db.withdrawal(subject)
     removed = holdings.counts
     # which was interrupted, and may have removed some of them
-    if entry is not None and entry.is_withdrawal:
-        removed |= Counter(entry.body.get("removed", {}))
+    if entry is not None:
+        removed |= Counter(entry.get("removed", {}))
     versions = tuple(
         f"{kind} of {take}: {_count(number)}"
         for (kind, take), number in holdings.takes.items()

@@ -42,7 +42,6 @@ RECORDED = (
     "generation",
     "generations",
     "gltf",
-    "new_consent",
     "refit",
 )
 NO_ARGUMENTS: Mapping[str, Any] = MappingProxyType({})

@@ -6,7 +6,6 @@ import shutil
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import asdict, replace
-from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -84,12 +83,10 @@ def ingest_take(db: Database, folder: str | Path, **options: Any) -> Record:
         Capture folder, format version 1.
     **options
         `crop`: what to keep of the scan, a box or the surroundings of the landmarks, by
-        default all of it. `new_consent`: date on which a subject who was withdrawn
-        consented again; the scopes are those of the capture. `wait`: seconds to wait
-        for another run that ingests or fits the same take. `progress`: called with the
-        stage, the number of finished steps and the total number of steps. Others are
-        those of `skindb.ingest.IngestParameters`: spacing_mm, photographs, calibration,
-        refine.
+        default all of it. `wait`: seconds to wait for another run that ingests or fits
+        the same take. `progress`: called with the stage, the number of finished steps
+        and the total number of steps. Others are those of
+        `skindb.ingest.IngestParameters`: spacing_mm, photographs, calibration, refine.
 
     Returns
     -------
@@ -101,7 +98,7 @@ def ingest_take(db: Database, folder: str | Path, **options: Any) -> Record:
     InputError
         With every fault of the folder, before anything is visible; also without the
         consent to fit, if another run ingests or fits the take, or if the subject was
-        withdrawn and no new consent is given.
+        withdrawn.
     """
     return ingest_if_changed(db, folder, again=True, **options)[0]
 
@@ -112,7 +109,6 @@ def ingest_if_changed(
     *,
     again: bool = False,
     crop: Crop | None = None,
-    new_consent: date | None = None,
     wait: float = 0.0,
     progress: Progress | None = None,
     **parameters: Any,
@@ -132,19 +128,12 @@ def ingest_if_changed(
     capture = calibrated_capture(db, read_capture(folder, crop=crop))
     capture = _with_note_of_session(db, capture)
     record = IngestParameters(**parameters)
-    if not again and new_consent is None:
+    if not again:
         stored = _unchanged(db, capture, record)
         if stored is not None:
             return stored, False
     scratch = db.scratch() / scratch_name(capture, record)
-    with logged_action(
-        db, "ingest", [capture.take], arguments={"new_consent": new_consent is not None}
-    ):
-        if new_consent is not None:
-            require_consent(
-                {"consent_scope": capture.consent_scope, "take": capture.take}, "fit"
-            )
-            db.readmit(subject_of(capture.take), new_consent)
+    with logged_action(db, "ingest", [capture.take]):
         remove_stale(scratch)
         try:
             return _ingest(db, capture, record, scratch, wait, progress), True
@@ -247,14 +236,14 @@ def _require_admitted(db: Database, take: str, scratch: Path) -> None:
     is withdrawn.
     """
     entry = db.withdrawal(subject_of(take))
-    if entry is not None and entry.is_withdrawal:
+    if entry is not None:
         shutil.rmtree(scratch, ignore_errors=True)
         raise WithdrawnError(
             Fault(
                 subject_of(take),
-                "a withdrawn subject must consent again before a capture is ingested",
-                f"a withdrawal on {entry.date}",
-                "if there is a new consent, state its date with --new-consent",
+                "captures of a withdrawn subject must not be ingested",
+                f"a withdrawal on {entry['withdrawn'][:10]}",
+                "if the subject consented again, give it a new pseudonym",
             )
         )
 

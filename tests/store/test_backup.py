@@ -278,20 +278,6 @@ def test_erase_from_backup__leaves_the_bytes_of_others(db, dest, tmp_path):
         assert copy.verify() == []
 
 
-def test_restore__of_a_subject_who_was_admitted_again(db, dest, tmp_path):
-    db.backup(str(dest))
-    db.erase(SUBJECT)
-    db.readmit(SUBJECT, db.withdrawal(SUBJECT).date)
-    _commit(db.url, "capture", SUBJECT, 7.0)
-    db.backup(str(dest))
-    old = _restored(db, dest, tmp_path / "old", number=1)
-    assert old.takes("capture") == ["B"]
-    new = _restored(db, dest, tmp_path / "new")
-    assert float(new.read("capture", SUBJECT)["surfels/surfel_area"][0]) == 7.0
-    assert old.verify() == new.verify() == []
-    _commit(old.url, "capture", SUBJECT, 8.0)  # the readmission was repeated
-
-
 def test_restore__repeats_later_consents(db, dest, tmp_path):
     db.record_consent("B", ["fit", "statistics"])
     db.backup(str(dest))

@@ -5,8 +5,6 @@ and nothing else.
 from __future__ import annotations
 
 import errno
-import json
-from datetime import date
 
 import numpy as np
 import pytest
@@ -14,7 +12,7 @@ from traces import contents
 
 from skindb.errors import InputError
 from skindb.schema import dataset
-from skindb.store import Database, Request, Staleness, WithdrawnError, seal_of
+from skindb.store import Database, Request, Staleness, WithdrawnError
 from skindb.store import erasure as erasure_module
 from skindb.store.folder import Folder
 from skindb.store.stale import write_request
@@ -268,7 +266,7 @@ def test_erase__only_scratch_of_a_killed_ingest(db):
     scratch.mkdir(parents=True)
     assert db.erase("A").removed == {}
     assert not scratch.exists()
-    assert db.withdrawal("A").is_withdrawal
+    assert db.withdrawal("A") is not None
 
 
 def test_erase__requests_results_without_takes_of_the_subject(db):
@@ -463,59 +461,5 @@ def test_erase__a_second_run_is_refused_before_the_first_has_an_effect_on_it(
 
     monkeypatch.setattr(erasure_module, "mark_withdrawn", race)
     db.erase("A")
-    assert db.withdrawal("A").number == 1
+    assert len(db.place.children("withdrawn")) == 1
     assert db.verify() == []
-
-
-def test_readmit__new_versions_are_visible_and_old_ones_never(db):
-    old = _fitted(db, "A")
-    _fitted(db, "B")
-    record = (db.root / "log/model/A/00000001.json").read_bytes()
-    db.erase("A")
-    db.readmit("A", date.today())
-    new = _fitted(db, "A")
-    assert new.admissions == {"A": 2}
-    assert new.seal != old.seal
-    study = _commit(db, "population", "traits", [new, db.record("model", "B")])
-    assert study.admissions == {"A": 2}
-    assert db.takes("model") == ["A", "B"]
-    assert db.record("model", "A") == new
-    assert db.verify() == []
-    # of a writer that was suspended all the time
-    late = db.root / "log/model/A/00000002.json"
-    late.write_text(_with_generation(record, 2))
-    with pytest.raises(
-        WithdrawnError,
-        match="model 2 of A: a version must not refer to a withdrawn subject",
-    ):
-        db.record("model", "A")
-    assert db.record("model", "A", 1) == new
-    db.clean()
-    assert db.record("model", "A") == new
-    assert db.record("population", "traits") == study
-    assert db.verify() == []
-    db.erase("A")
-    assert db.takes("model") == ["B"]
-    assert db.takes("population") == []
-    assert db.withdrawal("A").number == 3
-
-
-def _with_generation(content: bytes, generation: int) -> str:
-    body = json.loads(content) | {"generation": generation}
-    body.pop("seal")
-    return json.dumps(body | {"seal": seal_of(body)})
-
-
-def test_readmit__waits_until_the_erasure_is_complete(db, monkeypatch):
-    _fitted(db, "A")
-    with monkeypatch.context() as patch:
-        patch.setattr(erasure_module, "erase_withdrawn", lambda _: None)
-        db.erase("A")
-    with pytest.raises(
-        InputError,
-        match="A: a withdrawal must be complete before the subject is admitted again",
-    ):
-        db.readmit("A", date.today())
-    db.clean()
-    db.readmit("A", date.today())
-    assert not db.withdrawal("A").is_withdrawal

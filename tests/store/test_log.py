@@ -12,6 +12,7 @@ from stored import commit
 from skindb.errors import InputError
 from skindb.store import Database
 from skindb.store.log import Log
+from skindb.store.record import FORMAT
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +53,7 @@ def test_record__is_sealed_and_carries_the_seal_before_it(db):
         bodies[0]["seal"],
         bodies[1]["seal"],
     ]
-    assert all(body["format"] == 3 for body in bodies)
+    assert all(body["format"] == FORMAT for body in bodies)
     # digests of files are in the manifest
     assert max(_record(db, g).stat().st_size for g in (1, 2, 3)) < 3000
 
@@ -144,7 +145,7 @@ def _reseal(file, changes):
         {"path": "data/capture/A1/../../../victim"},
         {"path": "data/capture/B1/20260101T000000-0123abcd.zarr"},
         {"path": 7},
-        {"format": 4},
+        {"format": FORMAT + 1},
         {"generation": 2},
         {"extra": 1},
     ],

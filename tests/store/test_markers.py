@@ -8,7 +8,7 @@ import os
 import shutil
 import stat
 from concurrent.futures import ThreadPoolExecutor
-from datetime import UTC, date, datetime
+from datetime import UTC, datetime
 from functools import partial
 
 import pytest
@@ -18,12 +18,11 @@ from skindb.errors import InputError
 from skindb.store import Database, MarkerFileWarning, markers
 from skindb.store.folder import Folder
 from skindb.store.markers import (
-    last_entry,
     mark_withdrawn,
     note_withdrawals,
     read_marker_file,
     read_markers,
-    readmit,
+    read_withdrawal,
     require_secret,
     subject_hash,
 )
@@ -39,19 +38,10 @@ class _Clock(datetime):
         return WITHDRAWN_AT
 
 
-class _Calendar(date):
-    """The calendar some weeks later."""
-
-    @classmethod
-    def today(cls):
-        return date(2026, 4, 1)
-
-
 @pytest.fixture
 def place(tmp_path, monkeypatch):
-    """A folder whose subject S01 was withdrawn on 10 March, on 1 April."""
+    """A folder whose subject S01 was withdrawn on 10 March."""
     monkeypatch.setattr(markers, "datetime", _Clock)
-    monkeypatch.setattr(markers, "date", _Calendar)
     found = Folder(tmp_path / "db")
     mark_withdrawn(found, "S01", {"model": 2})
     return found
@@ -100,55 +90,6 @@ def test_markers__contain_no_pseudonym(place):
         assert path.is_dir() or b"S01" not in path.read_bytes()
 
 
-def test_readmit__alternates_with_withdrawals(place):
-    readmit(place, "S01", date(2026, 3, 20))
-    assert not read_markers(place).is_withdrawn("S01")
-    assert last_entry(place, "S01").date == date(2026, 3, 20)
-    readmit(place, "S01", date(2026, 3, 20))  # the run that was interrupted after this
-    assert last_entry(place, "S01").number == 2
-    with pytest.raises(
-        InputError,
-        match="S01: a subject is admitted again once; found the new consent of 2026-03-20",
-    ):
-        readmit(place, "S01", date(2026, 3, 21))
-    mark_withdrawn(place, "S01", {})
-    assert read_markers(place).admission("S01") == 3
-
-
-def test_readmit__of_two_processes_the_second_finds_the_date_of_the_first(
-    place, monkeypatch
-):
-    create = Folder.create
-
-    def slower(self, key, data, **options):
-        monkeypatch.setattr(Folder, "create", create)
-        readmit(self, "S01", date(2026, 3, 20))
-        return create(self, key, data, **options)
-
-    monkeypatch.setattr(Folder, "create", slower)
-    with pytest.raises(InputError, match="found the new consent of 2026-03-20"):
-        readmit(place, "S01", date(2026, 3, 21))
-    assert last_entry(place, "S01").number == 2
-
-
-@pytest.mark.parametrize("day", [date(2026, 3, 8), date(2026, 4, 3)])
-def test_readmit__needs_a_date_between_the_withdrawal_and_today(place, day):
-    line = (
-        "S01: a new consent must be given after the withdrawal of the subject.*; "
-        f"found {day}, and a withdrawal on 2026"
-    )
-    with pytest.raises(InputError, match=line):
-        readmit(place, "S01", day)
-    assert read_markers(place).is_withdrawn("S01")
-
-
-def test_readmit__is_only_for_subjects_that_were_withdrawn(place):
-    with pytest.raises(
-        InputError, match="S02: a new consent is only for a subject who was withdrawn"
-    ):
-        readmit(place, "S02", date(2026, 3, 20))
-
-
 def test_read_markers__without_the_secret_nothing_is_read_or_written(tmp_path):
     """Otherwise a withdrawn subject would not be recognised."""
     db = Database(tmp_path / "db")
@@ -178,30 +119,26 @@ def test_read_markers__without_the_secret_nothing_is_read_or_written(tmp_path):
     assert db.verify() == []
 
 
-def test_verify__names_damaged_and_missing_entries(place):
+def test_read_withdrawal__says_when_and_what_was_removed(place):
+    entry = read_withdrawal(place, "S01")
+    assert (entry["withdrawn"][:10], entry["removed"]) == ("2026-03-10", {"model": 2})
+    assert read_withdrawal(place, "S02") is None
+
+
+def test_verify__names_damaged_entries(place):
     mark_withdrawn(place, "S02", {})
-    readmit(place, "S02", date(2026, 3, 20))
     db = Database(place.root)
     assert db.verify() == []
-    first, second = sorted(
-        (place.root / "withdrawn" / subject_hash(place, "S02")).iterdir()
+    first, second = (
+        place.root / f"withdrawn/{subject_hash(place, subject)}.json"
+        for subject in ("S01", "S02")
     )
     content = second.read_text()
-    for damage in (
-        None,
-        "{",
-        content.replace("2026-03-20", "2026-03-21"),
-        first.read_text(),
-    ):
-        second.unlink(missing_ok=True)
-        if damage is not None:
-            second.write_text(damage)
-            assert [fault.where for fault in db.verify()] == [str(second)]
-    second.write_text(content)
-    first.unlink()
-    (fault,) = db.verify()
-    assert fault.where == str(first)
-    assert fault.rule == "an entry of a withdrawal must be as it was created"
+    for damage in ("{", content.replace("2026-", "2025-"), first.read_text()):
+        second.write_text(damage)
+        (fault,) = db.verify()
+        assert fault.where == str(second)
+        assert fault.rule == "an entry of a withdrawal must be as it was created"
 
 
 SUBJECT = "Xqz7"
@@ -219,7 +156,7 @@ def _notes(db):
     return read_marker_file(db.place.marker_file(), require_secret(db.place))
 
 
-def test_marker_file__notes_withdrawals_readmissions_and_consents(db):
+def test_marker_file__notes_withdrawals_and_consents(db):
     db.record_consent(SUBJECT, ["fit"])
     db.record_consent("B", [])
     db.record_consent("B", ["fit", "export"])
@@ -233,8 +170,7 @@ def test_marker_file__notes_withdrawals_readmissions_and_consents(db):
     assert [*notes.entries] == [
         f"withdrawn/{name}" for name in db.place.sizes("withdrawn")
     ]
-    db.readmit(SUBJECT, db.withdrawal(SUBJECT).date)
-    assert len(_notes(db).entries) == 2
+    assert len(_notes(db).entries) == 1
     file = db.place.marker_file()
     assert SUBJECT.encode() not in file.read_bytes()
     assert stat.S_IMODE(file.stat().st_mode) == 0o600

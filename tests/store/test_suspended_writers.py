@@ -20,7 +20,7 @@ from skindb.store import lease as lease_module
 from skindb.store import stage as stage_module
 from skindb.store.bucket import Bucket
 from skindb.store.folder import Folder
-from skindb.store.markers import AdmissionGuard, WithdrawnError
+from skindb.store.markers import WithdrawalGuard, WithdrawnError
 
 SUBJECT = "Xqz7"
 HIDDEN = r"the database must hold it|a version must not refer to a withdrawn subject"
@@ -31,7 +31,7 @@ FOLDER_STEPS = [
     (Folder, "_try_write"),
     (Folder, "make_durable"),
     (Folder, "writable"),
-    (AdmissionGuard, "__call__"),
+    (WithdrawalGuard, "__call__"),
     (os, "link"),
     (os, "replace"),
     (stage_module, "require_inputs"),
@@ -40,7 +40,7 @@ FOLDER_STEPS = [
 BUCKET_STEPS = [
     (Bucket, "_put_new"),
     (Bucket, "_put"),
-    (AdmissionGuard, "__call__"),
+    (WithdrawalGuard, "__call__"),
     (stage_module, "require_inputs"),
 ]
 
@@ -258,7 +258,7 @@ def late(request, tmp_path):
     _commit(url, "population", "traits", inputs=[db.record("model", "B").as_input()])
     with pytest.MonkeyPatch.context() as patch:
         steps = Steps(0, partial(_withdraw, db))
-        patch.setattr(AdmissionGuard, "__call__", lambda _: None)
+        patch.setattr(WithdrawalGuard, "__call__", lambda _: None)
         steps.watch(patch, [(stage_module, "require_consents")])
         _study(db)
         _capture_late(db)
@@ -267,7 +267,7 @@ def late(request, tmp_path):
 
 def _capture_late(db: Database) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(AdmissionGuard, "_require", lambda *_: None)
+        patch.setattr(WithdrawalGuard, "__call__", lambda _: None)
         _capture(db)
 
 
