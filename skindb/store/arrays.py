@@ -47,9 +47,10 @@ class ShardedArray(BackendArray):
         """Values at one slice or index along each dim."""
         first, *others = key
         if not isinstance(first, slice):
-            return self.rows(first, first + 1)[(0, *others)]
+            return np.asarray(self.rows(first, first + 1)[(0, *others)])
         begin, end, step = first.indices(self.shape[0])
-        return self.rows(begin, max(begin, end))[(slice(None, None, step), *others)]
+        values = self.rows(begin, max(begin, end))
+        return np.asarray(values[(slice(None, None, step), *others)])
 
     def rows(self, begin: int, end: int) -> AnyArray:
         """Values from `begin` to `end` along the first dim."""
