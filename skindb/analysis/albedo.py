@@ -22,14 +22,14 @@ from skindb.analysis.study import (
     skipped_takes,
     table_of,
 )
-from skindb.analysis.subjects import groups_by, level_error, takes_to_compare
+from skindb.analysis.subjects import grouped, level_error
 from skindb.analysis.summary import SAMPLED
 from skindb.errors import input_error, require
-from skindb.numerics.statistics import Moments
+from skindb.numerics.statistics import SUMMARY, known_mean
 from skindb.parameters import group_option
 from skindb.schema import dataset, variables
-from skindb.schema.cohort import require_same_fit
-from skindb.schema.label import FACE
+from skindb.schema.cohort import require_comparable
+from skindb.schema.label import CHANNELS, FACE
 from skindb.types import Array, Mask, finite_rows
 
 if TYPE_CHECKING:
@@ -67,7 +67,6 @@ def albedo_histograms(
     *,
     regions: Sequence[str] = (FACE, "beard"),
     drawn: xr.Dataset | None = None,
-    mixed_fits: bool = False,
 ) -> xr.Dataset:
     """Histograms of decorrelated colour for every take and region.
 
@@ -86,8 +85,6 @@ def albedo_histograms(
     drawn
         ``db.cohort("surfels", kind="registration")`` of the same sample, with the
         regions defined by landmarks, which are used for takes whose capture lacks them.
-    mixed_fits
-        Accept takes that were fitted with different parameters.
 
     Returns
     -------
@@ -96,8 +93,7 @@ def albedo_histograms(
         that sum to 1), `albedo_mean`. Attribute `regions_by_landmarks`: region -> takes
         for which the region is defined by landmarks.
     """
-    if not mixed_fits:
-        require_same_fit(cohort)
+    require_comparable(cohort, "surfels")
     takes = cohort["take"].values.tolist()
     loaded = each_take(xr.Dataset.load, cohort, COLOUR_VARIABLES)
     drawn = None if drawn is None else drawn.load()
@@ -129,7 +125,7 @@ def albedo_histograms(
             variables.ALBEDO_HISTOGRAM: counted,
             variables.ALBEDO_MEAN: means,
         },
-        coords={"take": takes, "region": list(regions), "channel": ["R", "G", "B"]},
+        coords={"take": takes, "region": list(regions), "channel": CHANNELS},
         attrs={
             "skipped": skipped_takes(cohort),
             "regions_by_landmarks": by_landmarks,
@@ -245,48 +241,26 @@ def albedo_table(
         the surface is known by a prior. It shifts all groups equally, so that it cancels
         in differences of groups but not in ratios, and it matters most for dark skin.
     """
-    takes, people = takes_to_compare(cohort, group_by)
-    groups = groups_by(people, group_by)
-    names = sorted(set(groups))
-    labels = takes["take"].values.tolist()
-    members = [
-        [take for take, group in zip(labels, groups, strict=True) if group == name]
-        for name in names
-    ]
-    stacked = Moments.stacked(
-        Moments.of(albedo[variables.ALBEDO_MEAN].sel(take=group).values)
-        for group in members
+    groups = grouped(cohort, group_by)
+    members = groups.members.values()
+    means, histograms = (
+        albedo[name].sel(take=groups.takes["take"].values.tolist()).values
+        for name in (variables.ALBEDO_MEAN, variables.ALBEDO_HISTOGRAM)
     )
-    low, high = stacked.mean_interval()
-    is_known = stacked.count > 0
-    errors = [level_error(takes.sel(take=group)) for group in members]
-    histograms = [
-        Moments.of(albedo[variables.ALBEDO_HISTOGRAM].sel(take=group).values)
-        for group in members
-    ]
-    mean_histograms = np.stack(
-        [np.where(h.count > 0, h.mean, np.nan) for h in histograms]
-    )
+    errors = [level_error(groups.takes.isel(take=rows)) for rows in members]
+    mean_histograms = [known_mean(histograms[rows]) for rows in members]
     return dataset(
         {
-            variables.GROUP_ALBEDO_COUNT: stacked.count,
-            variables.GROUP_ALBEDO_MEAN: np.where(is_known, stacked.mean, np.nan),
-            variables.GROUP_ALBEDO_MEAN_LOW: low,
-            variables.GROUP_ALBEDO_MEAN_HIGH: high,
+            **groups.moments(means).summary("group_albedo"),
             variables.GROUP_EVEN_REFLECTION_ERROR: errors,
-            variables.GROUP_ALBEDO_STANDARD_DEVIATION: stacked.standard_deviation,
-            variables.GROUP_HISTOGRAM: mean_histograms,
+            variables.GROUP_HISTOGRAM: np.stack(mean_histograms),
         },
         coords={
-            "group": names,
+            "group": [*groups.members],
             "region": albedo["region"].values,
-            "channel": ["R", "G", "B"],
+            "channel": CHANNELS,
         },
-        attrs={
-            "takes": sorted(map(str, takes["take"].values)),
-            "group_by": group_by or "",
-            "skipped": skipped_takes(cohort),
-        },
+        attrs=groups.attrs,
     )
 
 
@@ -387,8 +361,7 @@ def tabulate_albedo(table: xr.Dataset, histograms: xr.Dataset) -> Table:
         return table_of(
             histograms, [variables.ALBEDO_MEAN], ("take", "region", "channel")
         )
-    columns = ("count", "mean", "mean_low", "mean_high", "standard_deviation")
-    names = [f"group_albedo_{column}" for column in columns]
+    names = [f"group_albedo_{name}" for name in SUMMARY]
     return table_of(table, names, ("group", "region", "channel"))
 
 
@@ -403,9 +376,12 @@ def albedo_and_texture(population: Population) -> Results:
     """Histograms of albedo, and distributions at every scale of the takes that are
     registered, whose landmarks draw the regions that captures lack.
     """
-    mixed = population.mixed_fits
     if not population.registered:
-        return {"albedo": albedo_histograms(population.cohort, mixed_fits=mixed)}
+        return {
+            "albedo": albedo_histograms(
+                population.cohort,
+            )
+        }
     drawn = population.open_cohort(
         "surfels",
         kind="registration",
@@ -414,10 +390,13 @@ def albedo_and_texture(population: Population) -> Results:
     )
     maps = population.open_cohort("maps", size=texture.SIZE, variables=texture.MAPPED)
     distributions = texture.texture_statistics(
-        maps, landmarks=population.landmarks, mixed_fits=mixed
+        maps,
+        landmarks=population.landmarks,
     )
     histograms = albedo_histograms(
-        population.cohort, regions=texture.REGIONS, drawn=drawn, mixed_fits=mixed
+        population.cohort,
+        regions=texture.REGIONS,
+        drawn=drawn,
     )
     return {"albedo": histograms, "texture": distributions}
 

@@ -35,7 +35,7 @@ from skindb.reflectance.mixture import basis_rows
 from skindb.reflectance.reduction import Systems, factor_reflectance, residuals
 from skindb.reflectance.tables import TableGrid, brdf_metric
 from skindb.schema import dataset, variables
-from skindb.schema.cohort import require_same_fit
+from skindb.schema.cohort import require_comparable
 from skindb.types import Array, Float32, Half, Index, dots, finite_rows, unit
 
 if TYPE_CHECKING:
@@ -78,7 +78,6 @@ def population_basis(
     tables: Array | Delayed,
     k: int = 6,
     in_metric: bool = False,
-    mixed_fits: bool = False,
     rng: np.random.Generator,
 ) -> xr.Dataset:
     """Basis of `k` components for the sampled surfels of all takes: of a person, a set
@@ -101,8 +100,6 @@ def population_basis(
     in_metric
         Minimise the error of BRDFs (`brdf_metric`). By default the error of
         coefficients is minimised, as in the paper.
-    mixed_fits
-        Accept takes that were fitted with different parameters.
     rng
         Random generator of the sample and of the starts of the factorisation.
 
@@ -119,8 +116,7 @@ def population_basis(
         If takes were fitted with different parameters or dictionaries, or if a take has
         no fitted surfels.
     """
-    if not mixed_fits:
-        require_same_fit(cohort)
+    require_comparable(cohort, "surfels")
     names = same_dictionary(cohort)
     takes = cohort["take"].values.tolist()
     X = _start_weights(cohort, takes, rng)
@@ -241,7 +237,6 @@ def basis_size_curve(
     tables: Array | Delayed,
     ks: Sequence[int] = range(1, 13),
     tolerance: float = 0.01,
-    mixed_fits: bool = False,
     rng: np.random.Generator,
 ) -> xr.Dataset:
     """Reconstruction error of reflectance as a function of the number of basis BRDFs.
@@ -265,8 +260,6 @@ def basis_size_curve(
         Sizes to try, ascending; only these sizes can be chosen.
     tolerance
         See `choose_size`.
-    mixed_fits
-        Accept takes that were fitted with different parameters.
     rng
         Random generator of the bootstrap.
 
@@ -279,8 +272,7 @@ def basis_size_curve(
         with the whole dictionary. Attributes: `size_status`, the result as a sentence,
         and `surfels`, their number.
     """
-    if not mixed_fits:
-        require_same_fit(cohort)
+    require_comparable(cohort, "surfels")
     same_dictionary(cohort)
     few = max(
         1, MAX_FACTORED // cohort.sizes["take"]
@@ -589,7 +581,6 @@ def compute(population: Population, parameters: Parameters) -> Results:
     curve = basis_size_curve(
         population.cohort,
         tables=population.brdf_tables(),
-        mixed_fits=population.mixed_fits,
         rng=np.random.default_rng(parameters.seed),
     )
     return {"basis_size": curve}

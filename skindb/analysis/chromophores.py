@@ -24,6 +24,7 @@ from sklearn.exceptions import ConvergenceWarning
 
 from skindb import plots
 from skindb.analysis.components import mean_face
+from skindb.analysis.quantities import Quantities
 from skindb.analysis.regions import map_regions
 from skindb.analysis.study import (
     Population,
@@ -33,14 +34,14 @@ from skindb.analysis.study import (
     skipped_takes,
     table_of,
 )
-from skindb.analysis.subjects import groups_by, takes_to_compare
+from skindb.analysis.subjects import grouped
 from skindb.analysis.texture import COVERED, DARKEST, LEAST_COVERED, MAPPED
 from skindb.errors import InputError, input_error, require
-from skindb.numerics.statistics import Moments, known_mean
+from skindb.numerics.statistics import SUMMARY, Moments
 from skindb.parameters import group_option, seed_option
 from skindb.schema import dataset, variables
-from skindb.schema.cohort import require_same_fit
-from skindb.schema.label import FACE
+from skindb.schema.cohort import require_comparable
+from skindb.schema.label import CHANNELS, FACE
 from skindb.schema.notes import note
 from skindb.types import Array, Mask, finite_rows, lengths
 
@@ -48,14 +49,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 CHROMOPHORES = ("melanin", "haemoglobin")
-CHANNELS = ("R", "G", "B")
-COLUMNS = (
-    variables.GROUP_CHROMOPHORE_COUNT,
-    variables.GROUP_CHROMOPHORE_MEAN,
-    variables.GROUP_CHROMOPHORE_MEAN_LOW,
-    variables.GROUP_CHROMOPHORE_MEAN_HIGH,
-    variables.GROUP_CHROMOPHORE_STANDARD_DEVIATION,
-)
+COLUMNS = tuple(f"group_chromophore_{name}" for name in SUMMARY)
 # absorption in Gaussian bands (standard deviation 30 nm) at 600, 540 and 450 nm
 # relative to that at 540 nm: eumelanin (Sarna and Swartz 1988), haemoglobin with 75 %
 # oxygenation (Prahl 1999); a test computes them from the tables
@@ -114,7 +108,6 @@ def chromophore_axes(
     cohort: xr.Dataset,
     *,
     landmarks: Mapping[str, Array] | None = None,
-    mixed_fits: bool = False,
     rng: np.random.Generator,
 ) -> xr.Dataset:
     """Absorption vectors of melanin and haemoglobin, from the variation of albedo within takes.
@@ -134,8 +127,6 @@ def chromophore_axes(
     landmarks
         Name -> (2,) position in the common (u, v), to restrict the texels to skin
         without beard, brows and lips. By default all measured texels are used.
-    mixed_fits
-        Accept takes that were fitted with different parameters.
     rng
         Random generator of the initial components and of the bootstrap.
 
@@ -153,8 +144,7 @@ def chromophore_axes(
     InputError
         If no texel of skin was measured, or if albedo does not vary within any take.
     """
-    if not mixed_fits:
-        require_same_fit(cohort)
+    require_comparable(cohort, "maps")
     size = cohort.sizes["v"]
     drawn = map_regions(landmarks or {}, size)
     flags = []
@@ -188,7 +178,7 @@ def chromophore_axes(
             variables.CHROMOPHORE_AXIS_SPREAD: spread,
             variables.DENSITY_VARIANCE: plane.variance,
         },
-        coords={"chromophore": list(CHROMOPHORES), "channel": list(CHANNELS)},
+        coords={"chromophore": CHROMOPHORES, "channel": CHANNELS},
         attrs={
             "axes_origin": origin,
             "flags": flags,
@@ -261,7 +251,7 @@ def chromophore_maps(maps: xr.Dataset, axes: xr.Dataset) -> xr.Dataset:
                 measured, residual, np.nan
             ).astype(np.float32),
         },
-        coords={"chromophore": list(CHROMOPHORES)},
+        coords={"chromophore": CHROMOPHORES},
     )
 
 
@@ -306,7 +296,7 @@ def chromophore_statistics(
         coords={
             "take": cohort["take"].values.tolist(),
             "region": list(drawn),
-            "chromophore": list(CHROMOPHORES),
+            "chromophore": CHROMOPHORES,
         },
         attrs={"skipped": skipped_takes(cohort)},
     )
@@ -333,51 +323,22 @@ def chromophore_table(
     Dataset
         (group, region, chromophore), see the variables of the group "chromophore_table".
     """
-    takes, people = takes_to_compare(cohort, group_by)
-    groups = groups_by(people, group_by)
-    names = sorted(set(groups))
-    values = (
-        statistics[variables.TAKE_CHROMOPHORE]
-        .sel(take=takes["take"].values.tolist())
-        .values
-    )
-    parts = []
-    for name in names:
-        rows_of_subject: dict[str, list[int]] = {}
-        for i, (group, subject) in enumerate(zip(groups, people.subject, strict=True)):
-            if group == name:
-                rows_of_subject.setdefault(subject, []).append(i)
-        parts.append(
-            Moments.of(
-                np.stack(
-                    [known_mean(values[rows]) for rows in rows_of_subject.values()]
-                )
-            )
-        )
-    stacked = Moments.stacked(parts)
-    low, high = (
-        np.where(stacked.count > 1, end, np.nan) for end in stacked.mean_interval()
+    groups = grouped(cohort, group_by)
+    values = statistics[variables.TAKE_CHROMOPHORE]
+    takes = groups.takes["take"].values.tolist()
+    of_takes = Quantities(values.sel(take=takes).values, groups.subject)
+    moments = Moments.stacked(
+        Moments.of(of_takes.select(rows).of_subjects().values)
+        for rows in groups.members.values()
     )
     return dataset(
-        {
-            variables.GROUP_CHROMOPHORE_COUNT: stacked.count,
-            variables.GROUP_CHROMOPHORE_MEAN: np.where(
-                stacked.count > 0, stacked.mean, np.nan
-            ),
-            variables.GROUP_CHROMOPHORE_MEAN_LOW: low,
-            variables.GROUP_CHROMOPHORE_MEAN_HIGH: high,
-            variables.GROUP_CHROMOPHORE_STANDARD_DEVIATION: stacked.standard_deviation,
-        },
+        moments.summary("group_chromophore"),
         coords={
-            "group": names,
+            "group": [*groups.members],
             "region": statistics["region"].values,
-            "chromophore": list(CHROMOPHORES),
+            "chromophore": CHROMOPHORES,
         },
-        attrs={
-            "takes": sorted(map(str, takes["take"].values)),
-            "group_by": group_by or "",
-            "skipped": skipped_takes(cohort),
-        },
+        attrs=groups.attrs,
     )
 
 
@@ -633,9 +594,8 @@ def compute(population: Population, parameters: Parameters) -> Results:
     """
     cohort = population.cohort
     landmarks = population.landmarks
-    mixed = population.mixed_fits
     rng = np.random.default_rng(parameters.seed)
-    axes = chromophore_axes(cohort, landmarks=landmarks, mixed_fits=mixed, rng=rng)
+    axes = chromophore_axes(cohort, landmarks=landmarks, rng=rng)
     statistics = chromophore_statistics(cohort, axes=axes, landmarks=landmarks)
     results = {
         "chromophores": axes.merge(statistics, combine_attrs="override"),
@@ -644,7 +604,7 @@ def compute(population: Population, parameters: Parameters) -> Results:
         ),
     }
     try:
-        results["mean_face"] = mean_face(cohort, mixed_fits=mixed)
+        results["mean_face"] = mean_face(cohort)
     except InputError as error:
         population.notes.extend(note("", str(fault)) for fault in error.faults)
     return results

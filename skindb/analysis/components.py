@@ -27,7 +27,8 @@ from skindb.numerics.statistics import Moments, known_mean
 from skindb.parameters import option
 from skindb.render.image import tone_map
 from skindb.schema import dataset, variables
-from skindb.schema.cohort import require_same_fit
+from skindb.schema.cohort import require_comparable
+from skindb.schema.label import CHANNELS
 from skindb.schema.notes import Note, note
 from skindb.types import Array, Bytes, Float64, Index, Mask
 
@@ -50,9 +51,7 @@ UNIT = {"units": "1", "long_name": "unit vector"}
 LEAST_KNOWN = 0.5
 
 
-def mean_face(
-    cohort: xr.Dataset, *, min_subjects: int = LEAST_SUBJECTS, mixed_fits: bool = False
-) -> xr.Dataset:
+def mean_face(cohort: xr.Dataset, *, min_subjects: int = LEAST_SUBJECTS) -> xr.Dataset:
     """Mean and standard deviation over subjects of albedo, sigma_tr and surface
     reflectance, texel by texel.
 
@@ -69,8 +68,6 @@ def mean_face(
         ``db.cohort("maps")``; the result omits maps that the cohort lacks.
     min_subjects
         Minimum number of subjects of a texel; texels with fewer are NaN.
-    mixed_fits
-        Accept takes that were fitted with different parameters.
 
     Returns
     -------
@@ -84,8 +81,7 @@ def mean_face(
     InputError
         If no texel has enough subjects.
     """
-    if not mixed_fits:
-        require_same_fit(cohort)
+    require_comparable(cohort, "maps")
     takes, subjects = takes_to_compare(cohort, None)
     names = [name for name in AVERAGED if name in takes]
     sums: dict[str, Moments] = {}
@@ -118,7 +114,7 @@ def mean_face(
     )
     return dataset(
         maps,
-        coords={"channel": ["R", "G", "B"]},
+        coords={"channel": CHANNELS},
         attrs={
             "subjects": len(subjects.names),
             "least_subjects": min_subjects,
@@ -286,9 +282,7 @@ def _expand(values: Array, is_used: Mask, shape: tuple[int, ...]) -> Float64:
     return out.reshape(*values.shape[:-1], *shape)
 
 
-def face_components(
-    cohort: xr.Dataset, *, max_components: int = 5, mixed_fits: bool = False
-) -> xr.Dataset:
+def face_components(cohort: xr.Dataset, *, max_components: int = 5) -> xr.Dataset:
     """Principal components of the albedo maps of a cohort, with the variable names of the store.
 
     Parameters
@@ -297,8 +291,6 @@ def face_components(
         ``db.cohort("maps")``; texels that a take did not measure count as unknown.
     max_components
         Maximum number of components.
-    mixed_fits
-        Accept takes that were fitted with different parameters.
 
     Returns
     -------
@@ -307,8 +299,7 @@ def face_components(
         `principal_variance_ratio`, `principal_residual`. Attributes: `skipped`, and
         `used_fraction`, the fraction of the texels that was used.
     """
-    if not mixed_fits:
-        require_same_fit(cohort)
+    require_comparable(cohort, "maps")
     albedo = cohort[variables.TEXEL_DIFFUSE_REFLECTANCE]
     components = principal_components(albedo, max_components=max_components)
     return dataset(
@@ -323,7 +314,7 @@ def face_components(
         },
         coords={
             "take": components["take"].values.tolist(),
-            "channel": ["R", "G", "B"],
+            "channel": CHANNELS,
         },
         attrs={
             "skipped": [*cohort.attrs.get("skipped", []), *components.attrs["skipped"]],
@@ -399,10 +390,7 @@ class Parameters:
 
 def compute(population: Population, parameters: Parameters) -> Results:
     """The results of the study."""
-    mixed = population.mixed_fits
-    components = face_components(
-        population.cohort, max_components=parameters.k, mixed_fits=mixed
-    )
+    components = face_components(population.cohort, max_components=parameters.k)
     return {"components": components}
 
 

@@ -4,15 +4,14 @@ and of maps have in common. The unit of inference is the subject.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from skindb.analysis.study import Population
+from skindb.analysis.quantities import Quantities
 from skindb.analysis.subjects import (
     CONDITION,
     NORMAL,
@@ -22,7 +21,6 @@ from skindb.analysis.subjects import (
     comparable_takes,
     has_attribute,
     has_trait,
-    level_error,
     multiple_correlation,
     require_adjustable,
     subjects_of,
@@ -38,15 +36,9 @@ from skindb.numerics.inference import (
     permutation_p,
     sign_flip_p,
 )
-from skindb.numerics.statistics import known_mean
 from skindb.parameters import ContrastParameters
-from skindb.schema import IDENTIFIED, variables
-from skindb.types import Array, Index, Mask, finite_rows, float64
+from skindb.types import Array, finite_rows
 
-Result = TypeVar("Result")
-CHANNELS = ("R", "G", "B")
-SURFACE = "surface reflectance"
-NORMAL_95 = 1.96
 # subjects of a group, below which intervals depend on the assumption of normal values
 FEW = 10
 # multiple correlation from which an attribute counts as confounder: a quarter of the
@@ -56,122 +48,14 @@ ASSOCIATED = 0.5
 MAX_CONDITION_NUMBER = 30.0
 
 
-# variable of the tables -> name, dims, and whether logarithms are compared
-TABULATED = {
-    variables.REGION_DIFFUSE_REFLECTANCE: ("R_d", ("region", "channel"), False),
-    variables.REGION_SURFACE_REFLECTANCE: (SURFACE, ("region",), False),
-    variables.SITE_SIGMA_TR: ("sigma_tr", ("site", "channel"), True),
-}
-
-
-def contrast_arguments(
-    population: Population, parameters: ContrastParameters
-) -> dict[str, Any]:
+def contrast_arguments(parameters: ContrastParameters) -> dict[str, Any]:
     """Keyword arguments of the function that compares the groups of a population."""
     return {
         "group_by": parameters.group_by,
         "adjust": parameters.adjust,
         "permutations": parameters.permutations,
-        "mixed_fits": population.mixed_fits,
         "rng": np.random.default_rng(parameters.seed),
     }
-
-
-@dataclass(frozen=True)
-class Quantities:
-    """Measured values of takes or of subjects."""
-
-    names: tuple[str, ...]  # for example "R_d face G"
-    values: Array  # (n, q) NaN where there is no value; logarithms where `is_log`
-    # (q,) whether logarithms are compared, so that intervals stay positive
-    is_log: Mask
-    # (q,) half-width of the 95 % interval of an error that all takes have in common
-    common: Array
-    subject: tuple[str, ...]  # (n,) names of the subjects
-
-    @property
-    def logarithmic(self) -> list[str]:
-        """Names of the quantities whose logarithms are compared."""
-        return list(itertools.compress(self.names, self.is_log.tolist()))
-
-    def of_subjects(self) -> Quantities:
-        """Means over the takes of every subject."""
-        names = tuple(dict.fromkeys(self.subject))
-        takes = [
-            np.array([name == subject for subject in self.subject]) for name in names
-        ]
-        values = np.stack([known_mean(self.values[rows]) for rows in takes])
-        return replace(self, values=values, subject=names)
-
-    def of_takes(self, rows: Mask) -> Quantities:
-        """The quantities of the selected takes."""
-        return self._select(np.flatnonzero(rows))
-
-    def of_named(self, subjects: Sequence[str]) -> Quantities:
-        """The quantities of the named subjects, in their order."""
-        return self._select([self.subject.index(name) for name in subjects])
-
-    def _select(self, rows: Sequence[int] | Index) -> Quantities:
-        subject = tuple(self.subject[i] for i in rows)
-        return replace(self, values=self.values[rows], subject=subject)
-
-
-def quantities_of(cohort: xr.Dataset) -> Quantities:
-    """Albedo and surface reflectance of regions and log sigma_tr of probe sites, for every take.
-
-    Parameters
-    ----------
-    cohort
-        ``db.cohort("tables")``.
-
-    Raises
-    ------
-    InputError
-        If no take has any of these quantities.
-    """
-    prefixes = ("region_", "site_")
-    tables = cohort[[name for name in cohort if str(name).startswith(prefixes)]].load()
-    half_width = NORMAL_95 * float(np.nan_to_num(level_error(cohort)))
-    names: list[str] = []
-    columns: list[Array] = []
-    is_log: list[bool] = []
-    common: list[float] = []
-    for variable, (prefix, dims, logarithmic) in TABULATED.items():
-        if variable not in tables:
-            continue
-        values = _table_values(tables, variable, dims, logarithmic=logarithmic)
-        is_albedo = variable == variables.REGION_DIFFUSE_REFLECTANCE
-        labels = [CHANNELS if dim == "channel" else tables[dim].values for dim in dims]
-        for words, column in zip(itertools.product(*labels), values.T, strict=True):
-            if np.isfinite(column).any():
-                names.append(" ".join([prefix, *map(str, words)]))
-                columns.append(column)
-                is_log.append(logarithmic)
-                common.append(half_width if is_albedo else 0.0)
-    require(
-        names,
-        "population",
-        "some take must have albedo, surface reflectance or sigma_tr",
-        "none of them",
-        "fit the takes again",
-    )
-    subject = tuple(map(str, cohort["subject"].values))
-    stacked = np.stack(columns, axis=1)
-    return Quantities(
-        tuple(names), stacked, np.array(is_log), np.array(common), subject
-    )
-
-
-def _table_values(
-    tables: xr.Dataset, variable: str, dims: tuple[str, ...], *, logarithmic: bool
-) -> Array:
-    """Values (take, q) of a variable, or the logarithms of identified ones."""
-    values = float64(tables[variable].transpose("take", *dims).values)
-    if logarithmic:
-        identified = tables[variables.SITE_STATUS].isin(IDENTIFIED)
-        good = identified.transpose("take", *dims).values & (values > 0)
-        values = np.where(good, np.log(np.where(good, values, 1.0)), np.nan)
-    return values.reshape(len(values), -1)
 
 
 @dataclass(frozen=True)
@@ -196,7 +80,7 @@ class Contrast:
         rows = np.isfinite(self.regressor) & finite_rows(self.covariates)
         return replace(
             self,
-            quantities=self.quantities.of_takes(rows),
+            quantities=self.quantities.select(np.flatnonzero(rows)),
             regressor=self.regressor[rows],
             covariates=self.covariates[rows],
         )
@@ -295,11 +179,11 @@ def _carriers(everyone: Subjects, subjects: Subjects, trait: str) -> dict[str, f
 
 
 @dataclass(frozen=True)
-class Comparison(Generic[Result]):
-    """A contrast with its result, associated attributes and warnings."""
+class Comparison:
+    """A contrast with its test, associated attributes and warnings."""
 
     contrast: Contrast
-    result: Result
+    test: ContrastTest
     associated: dict[str, float]  # attribute -> multiple correlation
     flags: list[str]
 
@@ -309,19 +193,26 @@ def compare_groups(
     group_by: str,
     adjust: Sequence[str],
     measure: Callable[[xr.Dataset], Quantities],
-    statistics: Callable[[Contrast], Result],
-) -> tuple[list[Comparison[Result]], list[Fault]]:
-    """Comparisons with the results of `statistics`, and a fault for each contrast for
-    which it raises `ValueError`; arguments as of `contrasts`.
+    *,
+    permutations: int,
+    min_fraction: float = 0.0,
+    rng: np.random.Generator,
+) -> tuple[list[Comparison], list[Fault]]:
+    """Comparisons with their tests, and a fault for each contrast that the subjects do
+    not determine; arguments as of `contrasts` and `contrast_test`.
     """
     subjects = subjects_of(cohort)
-    attributes = other_attributes(subjects, group_by)
+    compared_attribute = attribute_of(subjects, group_by)
     compared = []
     faults = []
     for contrast in contrasts(cohort, group_by, adjust, measure):
         try:
-            result = statistics(contrast)
-            associated = associations(contrast, subjects, attributes)
+            test = contrast_test(contrast, permutations, min_fraction, rng)
+            associated = {
+                name: _association(contrast, subjects, name)
+                for name in subjects.described
+                if name != compared_attribute
+            }
             flags = contrast_flags(contrast, subjects, associated, adjust)
         except ValueError as error:
             faults.append(
@@ -333,7 +224,7 @@ def compare_groups(
                 )
             )
         else:
-            compared.append(Comparison(contrast, result, associated, flags))
+            compared.append(Comparison(contrast, test, associated, flags))
     return compared, faults
 
 
@@ -347,15 +238,15 @@ def _paired(
     if group_by != CONDITION:
         names = [trait_of(subjects, group_by).partition(":")[2]]
     quantities = measure(cohort)
-    plain = quantities.of_takes(conditions == NORMAL)
+    plain = quantities.select(np.flatnonzero(conditions == NORMAL))
     pairs = []
     for name in names:
-        changed = quantities.of_takes(conditions == name)
+        changed = quantities.select(np.flatnonzero(conditions == name))
         both = [s for s in dict.fromkeys(changed.subject) if s in plain.subject]
         if not both:
             continue
-        after = changed.of_subjects().of_named(both)
-        before = plain.of_subjects().of_named(both).values
+        after = changed.of_subjects(both)
+        before = plain.of_subjects(both).values
         difference = replace(after, values=after.values - before)
         ones = np.ones(len(both))
         nothing = np.empty((len(both), 0))
@@ -382,19 +273,24 @@ class ContrastTest:
 
 
 def contrast_test(
-    contrast: Contrast, values: Array, max_draws: int, rng: np.random.Generator
+    contrast: Contrast, permutations: int, min_fraction: float, rng: np.random.Generator
 ) -> ContrastTest:
-    """Effects on values (n, q) of the subjects of a contrast; raises `ValueError` where
-    the subjects do not determine them.
+    """Effects on the quantities that at least a fraction of the subjects has, NaN for
+    others; raises `ValueError` where the subjects do not determine any.
     """
+    values = contrast.quantities.values
+    able = np.isfinite(values).sum(axis=0) >= max(min_fraction * len(values), 1)
+    if min_fraction and not able.any():
+        raise ValueError(
+            f"no texel with values of {min_fraction:.0%} of the {len(values)} subjects"
+        )
+    values = np.where(able, values, np.float32(np.nan))
+    draws: dict[str, Any] = {"max_draws": permutations, "rng": rng}
     if contrast.is_paired:
-        fit = paired_effects(values)
-        return ContrastTest(fit, *sign_flip_p(values, max_draws=max_draws, rng=rng))
+        return ContrastTest(paired_effects(values), *sign_flip_p(values, **draws))
     design = (contrast.regressor, contrast.covariates)
     fit = effects(values, *design)
-    return ContrastTest(
-        fit, *permutation_p(values, *design, max_draws=max_draws, rng=rng)
-    )
+    return ContrastTest(fit, *permutation_p(values, *design, **draws))
 
 
 def contrast_counts(contrast: Contrast) -> Array:
@@ -410,21 +306,6 @@ def contrast_counts(contrast: Contrast) -> Array:
     return np.stack(
         [is_known[is_with].sum(axis=0), is_known[~is_with].sum(axis=0)], axis=1
     )
-
-
-def other_attributes(subjects: Subjects, group_by: str) -> list[str]:
-    """Attributes that may be confounded with the compared one."""
-    compared = attribute_of(subjects, group_by)
-    return [name for name in subjects.described if name != compared]
-
-
-def associations(
-    contrast: Contrast, subjects: Subjects, attributes: Sequence[str]
-) -> dict[str, float]:
-    """Multiple correlations of the compared attribute with each of the others; 0 within
-    subjects, NaN where it is unknown.
-    """
-    return {name: _association(contrast, subjects, name) for name in attributes}
 
 
 def _association(contrast: Contrast, subjects: Subjects, name: str) -> float:

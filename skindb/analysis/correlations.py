@@ -11,7 +11,7 @@ import xarray as xr
 from scipy import stats
 
 from skindb import plots
-from skindb.analysis.contrasts import CHANNELS, SURFACE, Quantities, quantities_of
+from skindb.analysis.quantities import SURFACE, Quantities, quantities_of
 from skindb.analysis.study import (
     Population,
     Results,
@@ -25,8 +25,8 @@ from skindb.errors import input_error, require
 from skindb.numerics.statistics import known_mean
 from skindb.parameters import permutations_option, seed_option
 from skindb.schema import dataset, variables
-from skindb.schema.cohort import require_same_fit, require_takes
-from skindb.schema.label import FACE
+from skindb.schema.cohort import require_comparable
+from skindb.schema.label import CHANNELS, FACE
 from skindb.types import Array, finite_rows
 
 if TYPE_CHECKING:
@@ -57,7 +57,6 @@ def component_correlations(
     *,
     region: str = FACE,
     permutations: int = 10_000,
-    mixed_fits: bool = False,
     rng: np.random.Generator,
 ) -> xr.Dataset:
     """Correlations between subjects of the three components of skin: albedo, surface
@@ -75,8 +74,6 @@ def component_correlations(
         Region of which albedo and surface reflectance are used.
     permutations
         Maximum number of permutations for p values.
-    mixed_fits
-        Accept takes that were fitted with different parameters.
     rng
         Random generator of the bootstrap and the permutations.
 
@@ -94,9 +91,7 @@ def component_correlations(
     InputError
         If the region is unknown, or if fewer than five subjects have two components.
     """
-    require_takes(cohort, "tables")
-    if not mixed_fits:
-        require_same_fit(cohort)
+    require_comparable(cohort, "tables")
     takes, _ = takes_to_compare(cohort, None)
     _require_region(takes, region)
     values = _components(quantities_of(takes), region)
@@ -275,7 +270,6 @@ def compute(population: Population, parameters: Parameters) -> Results:
     table = component_correlations(
         population.cohort,
         permutations=parameters.permutations,
-        mixed_fits=population.mixed_fits,
         rng=np.random.default_rng(parameters.seed),
     )
     return {"correlations": table}

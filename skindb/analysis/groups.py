@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -12,17 +13,13 @@ from scipy.special import gammaln
 
 from skindb import plots
 from skindb.analysis.contrasts import (
-    SURFACE,
     Comparison,
     Contrast,
-    ContrastTest,
-    Quantities,
     compare_groups,
     contrast_arguments,
     contrast_counts,
-    contrast_test,
-    quantities_of,
 )
+from skindb.analysis.quantities import SURFACE, Quantities, quantities_of
 from skindb.analysis.study import (
     Population,
     Results,
@@ -33,18 +30,11 @@ from skindb.analysis.study import (
 )
 from skindb.analysis.subjects import notes_on_attributes, subjects_of
 from skindb.errors import InputError, few_names
-from skindb.numerics.inference import (
-    Effects,
-)
-from skindb.numerics.statistics import (
-    detectable_difference,
-    known_mean,
-)
-from skindb.parameters import (
-    ContrastParameters,
-)
+from skindb.numerics.inference import Effects
+from skindb.numerics.statistics import detectable_difference, known_mean
+from skindb.parameters import ContrastParameters
 from skindb.schema import dataset, variables
-from skindb.schema.cohort import require_same_fit, require_takes
+from skindb.schema.cohort import require_comparable
 from skindb.types import Array
 
 if TYPE_CHECKING:
@@ -73,7 +63,6 @@ def group_effects(
     group_by: str,
     adjust: Sequence[str] = (),
     permutations: int = 10_000,
-    mixed_fits: bool = False,
     rng: np.random.Generator,
 ) -> xr.Dataset:
     """Differences between groups of subjects in all measured quantities.
@@ -93,8 +82,6 @@ def group_effects(
         Attributes for which the regression adjusts. Subjects without them are excluded.
     permutations
         Maximum number of permutations for p values; if there are fewer, all of them are used.
-    mixed_fits
-        Accept takes that were fitted with different parameters.
     rng
         Random generator of the permutations.
 
@@ -120,15 +107,11 @@ def group_effects(
     MacKinnon and White 1985 (HC3); Freedman and Lane 1983; Westfall and Young 1993;
     Benjamini and Hochberg 1995.
     """
-    require_takes(cohort, "tables")
+    require_comparable(cohort, "tables")
     adjust = (adjust,) if isinstance(adjust, str) else tuple(adjust)
-    if not mixed_fits:
-        require_same_fit(cohort)
-
-    def test(contrast: Contrast) -> ContrastTest:
-        return contrast_test(contrast, contrast.quantities.values, permutations, rng)
-
-    compared, faults = compare_groups(cohort, group_by, adjust, quantities_of, test)
+    compared, faults = compare_groups(
+        cohort, group_by, adjust, quantities_of, permutations=permutations, rng=rng
+    )
     if not compared:
         raise InputError(faults)
     statistics = [_statistics(comparison) for comparison in compared]
@@ -153,19 +136,21 @@ def group_effects(
         attrs={
             "group_by": group_by,
             "adjust": list(adjust),
-            "permutations": [comparison.result.permutations for comparison in compared],
+            "permutations": [comparison.test.permutations for comparison in compared],
             "smallest_p": [_smallest_p(comparison) for comparison in compared],
-            "logarithmic": quantities.logarithmic,
+            "logarithmic": list(
+                itertools.compress(quantities.names, quantities.is_log)
+            ),
             "flags": flags + notes_on_attributes(subjects_of(cohort)),
             "skipped": skipped_takes(cohort),
         },
     )
 
 
-def _statistics(comparison: Comparison[ContrastTest]) -> dict[str, Array]:
+def _statistics(comparison: Comparison) -> dict[str, Array]:
     """Variables of a comparison for every quantity, and its associated attributes."""
     contrast = comparison.contrast
-    test = comparison.result
+    test = comparison.test
     fit = test.effects
     p = test.p
     percent, low, high = _percent(fit, _reference(contrast, fit), contrast.quantities)
@@ -208,10 +193,10 @@ def _reference(contrast: Contrast, fit: Effects) -> Array:
     return np.asarray(known_mean(values) - fit.slope * centre)
 
 
-def _smallest_p(comparison: Comparison[ContrastTest]) -> float:
+def _smallest_p(comparison: Comparison) -> float:
     """The smallest p value that is possible with its number of permutations and subjects."""
     contrast = comparison.contrast
-    smallest = 1 / (comparison.result.permutations + 1)
+    smallest = 1 / (comparison.test.permutations + 1)
     if contrast.is_paired:
         # with all signs changed, the statistic has the same magnitude
         return max(smallest, 2.0 ** (1 - len(contrast.regressor)))
@@ -250,9 +235,7 @@ def _percent(
     )
 
 
-def _flags(
-    comparison: Comparison[ContrastTest], statistics: dict[str, Array]
-) -> list[str]:
+def _flags(comparison: Comparison, statistics: dict[str, Array]) -> list[str]:
     """Warnings about a comparison and the significance that it can reach."""
     contrast = comparison.contrast
     flags = comparison.flags + _surface_flag(contrast, statistics)
@@ -272,7 +255,7 @@ def _surface_flag(contrast: Contrast, statistics: dict[str, Array]) -> list[str]
     small = differ & (np.abs(statistics[variables.EFFECT]) < contrast.quantities.common)
     if not (differ & np.char.startswith(names, SURFACE)).any() or not small.any():
         return []
-    limit = float(contrast.quantities.common.max())
+    limit = max(contrast.quantities.common)
     note = f"differences of R_d up to {limit:.2g} may be due to its even reflection"
     return [f"{contrast.name}: the surface reflectance differs as well; {note}"]
 
@@ -397,9 +380,7 @@ def tabulate_group_effects(table: xr.Dataset) -> Table:
 def compute(population: Population, parameters: ContrastParameters) -> Results:
     """The results of the study."""
     return {
-        "effects": group_effects(
-            population.cohort, **contrast_arguments(population, parameters)
-        )
+        "effects": group_effects(population.cohort, **contrast_arguments(parameters))
     }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -10,17 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from skindb.analysis.contrasts import (
-    CHANNELS,
-    SURFACE,
-    Comparison,
-    Contrast,
-    Quantities,
-    compare_groups,
-    contrast_arguments,
-    contrast_test,
-)
+from skindb.analysis.contrasts import Comparison, compare_groups, contrast_arguments
 from skindb.analysis.groups import SIGNIFICANT
+from skindb.analysis.quantities import QUANTITIES, SURFACE, Quantities, Quantity
 from skindb.analysis.study import (
     Population,
     Results,
@@ -33,27 +25,20 @@ from skindb.analysis.subjects import notes_on_attributes, subjects_of
 from skindb.errors import Fault, InputError, input_error
 from skindb.parameters import ContrastParameters, permutations_option
 from skindb.schema import dataset, variables
-from skindb.schema.cohort import require_same_fit, require_takes
+from skindb.schema.cohort import require_comparable
+from skindb.schema.label import CHANNELS
 from skindb.types import Array, finite_rows
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-TexelResult = tuple[dict[str, Array], int]  # statistics, and number of permutations
 # texels along each side: about 1 mm each, which is also the accuracy of landmarks
 SIZE = 256
 # minimum fraction of the compared subjects that must have a value at a texel
 MIN_FRACTION = 0.8
 COVERED = 0.5  # minimum fraction of a texel that must be measured
 LOGARITHMIC = "sigma_tr"
-# variable of the maps -> name of the quantity; p values are adjusted for all texels and
-# channels of a variable
-MAPPED = {
-    variables.TEXEL_DIFFUSE_REFLECTANCE: "R_d",
-    variables.TEXEL_SURFACE_REFLECTANCE: SURFACE,
-    variables.TEXEL_SIGMA_TR: LOGARITHMIC,
-}
 PERMUTATIONS = 1000  # of each of 65,536 texels
 SHOWN_FRACTION = 0.995  # fraction of the texels within the range of a colour scale
 SHOWN = ("R_d G", SURFACE, "sigma_tr G")
@@ -67,7 +52,6 @@ def effect_maps(
     size: int = SIZE,
     permutations: int = PERMUTATIONS,
     min_fraction: float = MIN_FRACTION,
-    mixed_fits: bool = False,
     rng: np.random.Generator,
 ) -> xr.Dataset:
     """Effect of an attribute on albedo, surface reflectance and log sigma_tr at every
@@ -83,7 +67,7 @@ def effect_maps(
     ----------
     cohort
         ``db.cohort("maps")``.
-    group_by, adjust, mixed_fits, rng
+    group_by, adjust, rng
         See `group_effects`.
     size
         Texels along each side; it must divide the size of the maps of the cohort.
@@ -104,108 +88,85 @@ def effect_maps(
     InputError
         If there are no groups to compare, or if no texel has values of enough subjects.
     """
-    require_takes(cohort, "maps")
+    require_comparable(cohort, "maps")
     adjust = (adjust,) if isinstance(adjust, str) else tuple(adjust)
-    if not mixed_fits:
-        require_same_fit(cohort)
     _require_divisor(size, cohort.sizes["v"])
-    test = partial(
-        _texel_statistics, max_draws=permutations, min_fraction=min_fraction, rng=rng
-    )
-    compare = partial(compare_groups, cohort, group_by, adjust, statistics=test)
-    parts, flags, faults = _variable_maps(cohort, size, compare)
-    if not parts:
-        raise InputError(
-            faults
-            or Fault(
-                "maps",
-                "some texels must be measured",
-                "none",
-                "fit or register more takes",
-            )
-        )
-    quantities = [name for part in parts for name in part.quantities]
-    logarithmic = [name for name in quantities if name.startswith(LOGARITHMIC)]
-    flags += notes_on_attributes(subjects_of(cohort))
-    excluded = [f"{fault.where}: excluded, {fault.found}" for fault in faults]
-    return dataset(
-        {
-            name: np.concatenate([part.values[name] for part in parts], axis=1)
-            for name in parts[0].values
-        },
-        coords={"contrast": parts[0].contrasts, "quantity": quantities},
-        attrs={
-            "group_by": group_by,
-            "adjust": list(adjust),
-            "permutations": parts[-1].permutations,
-            "logarithmic": logarithmic,
-            "flags": [*dict.fromkeys(flags), *excluded],
-            "skipped": skipped_takes(cohort),
-        },
-    )
-
-
-@dataclass(frozen=True)
-class _VariableMaps:
-    """Statistics of the contrasts at the texels of one variable."""
-
-    contrasts: list[str]
-    quantities: list[str]  # one for each channel
-    permutations: list[int]  # of each contrast
-    values: dict[str, Array]  # (contrast, quantity, v, u)
-
-    @classmethod
-    def of(
-        cls,
-        values: xr.DataArray,
-        compared: Sequence[Comparison[TexelResult]],
-        size: int,
-    ) -> _VariableMaps:
-        """Arrange the statistics (texel * channel,) of comparisons of these maps."""
-        title = MAPPED[str(values.name)]
-        quantities = [f"{title} {c}" for c in CHANNELS] if values.ndim == 4 else [title]
-        contrasts = [comparison.contrast.name for comparison in compared]
-        statistics = [comparison.result[0] for comparison in compared]
-        permutations = [comparison.result[1] for comparison in compared]
-        shape = (len(statistics), size, size, len(quantities))
-        arranged = {}
-        for name in statistics[0]:
-            stacked = np.stack([texels[name] for texels in statistics])
-            arranged[name] = np.moveaxis(stacked.reshape(shape), -1, 1)
-        return cls(contrasts, quantities, permutations, arranged)
-
-
-def _variable_maps(
-    cohort: xr.Dataset,
-    size: int,
-    compare: Callable[..., tuple[list[Comparison[TexelResult]], list[Fault]]],
-) -> tuple[list[_VariableMaps], list[str], list[Fault]]:
-    """Statistics of the variables with the same comparisons, and flags and faults of all."""
-    parts: list[_VariableMaps] = []
+    parts: list[xr.Dataset] = []
     flags: list[str] = []
     faults: list[Fault] = []
-    for variable in [name for name in MAPPED if name in cohort]:
-        measure = partial(_texel_quantities, variable=variable, size=size)
-        compared, undetermined = compare(measure=measure)
-        title = MAPPED[variable]
+    for quantity in [quantity for quantity in QUANTITIES if quantity.mapped in cohort]:
+        compared, undetermined = compare_groups(
+            cohort,
+            group_by,
+            adjust,
+            partial(_texel_quantities, quantity=quantity, size=size),
+            permutations=permutations,
+            min_fraction=min_fraction,
+            rng=rng,
+        )
         flags += [flag for comparison in compared for flag in comparison.flags]
-        faults += [replace(f, where=f"{f.where}, {title}") for f in undetermined]
+        name = quantity.name
+        faults += [replace(f, where=f"{f.where}, {name}") for f in undetermined]
         if not compared:
             continue
-        maps = _VariableMaps.of(cohort[variable], compared, size)
-        # a contrast is missing for this variable only
-        if parts and maps.contrasts != parts[0].contrasts:
-            faults.append(
-                Fault(
-                    title,
-                    "every comparison must have texels",
-                    "none for some",
-                    "exclude takes",
-                )
-            )
+        maps = _arranged(compared, cohort[quantity.mapped], name, size)
+        if parts and not maps["contrast"].equals(parts[0]["contrast"]):
+            # a contrast is missing for this variable only
+            rule = "every comparison must have texels"
+            faults.append(Fault(name, rule, "none for some", "exclude takes"))
         else:
             parts.append(maps)
-    return parts, flags, faults
+    if not parts:
+        cure = "fit or register more takes"
+        nothing = Fault("maps", "some texels must be measured", "none", cure)
+        raise InputError(faults or nothing)
+    flags += notes_on_attributes(subjects_of(cohort))
+    result = xr.concat(parts, "quantity")
+    names = result["quantity"].values.tolist()
+    return result.assign_attrs(
+        group_by=group_by,
+        adjust=list(adjust),
+        permutations=parts[-1].attrs["permutations"],
+        logarithmic=[name for name in names if name.startswith(LOGARITHMIC)],
+        flags=[
+            *dict.fromkeys(flags),
+            *(f"{fault.where}: excluded, {fault.found}" for fault in faults),
+        ],
+        skipped=skipped_takes(cohort),
+    )
+
+
+def _arranged(
+    compared: Sequence[Comparison], values: xr.DataArray, name: str, size: int
+) -> xr.Dataset:
+    """Statistics (contrast, quantity, v, u) of comparisons of the texels of a variable,
+    of which each channel is a quantity.
+    """
+    titles = (
+        [f"{name} {channel}" for channel in CHANNELS] if values.ndim == 4 else [name]
+    )
+    statistics: dict[str, list[Array]] = {}
+    for comparison in compared:
+        test = comparison.test
+        half_width = (test.effects.high - test.effects.low) / 2
+        is_known = np.isfinite(comparison.contrast.quantities.values)
+        for variable, texels in (
+            (variables.MAP_EFFECT, test.effects.slope),
+            (variables.MAP_EFFECT_HALF_WIDTH, half_width),
+            (variables.MAP_EFFECT_P, test.p),
+            (variables.MAP_EFFECT_P_ADJUSTED, test.p_adjusted),
+            (variables.MAP_EFFECT_COUNT, is_known.sum(axis=0)),
+        ):
+            maps = np.float32(texels).reshape(size, size, len(titles))
+            statistics.setdefault(variable, []).append(np.moveaxis(maps, -1, 0))
+    return dataset(
+        {variable: np.stack(maps) for variable, maps in statistics.items()},
+        coords={
+            "contrast": [comparison.contrast.name for comparison in compared],
+            "quantity": titles,
+        },
+        attrs={"permutations": [c.test.permutations for c in compared]},
+    )
 
 
 def _require_divisor(size: int, texels: int) -> None:
@@ -219,31 +180,21 @@ def _require_divisor(size: int, texels: int) -> None:
         )
 
 
-def _texel_quantities(takes: xr.Dataset, *, variable: str, size: int) -> Quantities:
-    """Values of a variable at every texel (and channel) of every take, as quantities."""
-    values = np.stack(
-        each_take(
-            _block_means, takes, [variable, variables.TEXEL_COVERAGE], variable, size
-        )
-    )
-    count = values.shape[1]
-    return Quantities(
-        tuple(map(str, range(count))),
-        values,
-        np.full(count, variable.endswith(LOGARITHMIC)),
-        np.zeros(count),
-        tuple(map(str, takes["subject"].values)),
-    )
+def _texel_quantities(
+    takes: xr.Dataset, *, quantity: Quantity, size: int
+) -> Quantities:
+    """Values of a quantity at every texel (and channel) of every take, as quantities."""
+    names = [quantity.mapped, variables.TEXEL_COVERAGE]
+    values = np.stack(each_take(_block_means, takes, names, quantity, size))
+    return Quantities(values, tuple(map(str, takes["subject"].values)))
 
 
-def _block_means(take: xr.Dataset, variable: str, size: int) -> Array:
+def _block_means(take: xr.Dataset, quantity: Quantity, size: int) -> Array:
     """Means (size * size * channels,) of the measured texels in blocks of texels; NaN
     where too few were measured.
     """
-    values = take[variable].values.astype(float)
-    values = values.reshape(*values.shape[:2], -1)
-    if variable.endswith(LOGARITHMIC):
-        values = np.log(np.where(values > 0, values, np.nan))
+    values = take[quantity.mapped].values.astype(float)
+    values = quantity.compared(values.reshape(*values.shape[:2], -1))
     is_known = finite_rows(values)
     weight = np.where(is_known, take[variables.TEXEL_COVERAGE].values, 0.0)[..., None]
     block = len(values) // size
@@ -253,35 +204,6 @@ def _block_means(take: xr.Dataset, variable: str, size: int) -> Array:
     mean = weighted / np.maximum(total, 1e-12)
     covered = total >= COVERED * block**2
     return np.where(covered, mean, np.nan).astype(np.float32).ravel()
-
-
-def _texel_statistics(
-    contrast: Contrast,
-    *,
-    max_draws: int,
-    min_fraction: float,
-    rng: np.random.Generator,
-) -> TexelResult:
-    """Statistics of a contrast at all texels (NaN for too few subjects), and the number
-    of permutations.
-    """
-    values = contrast.quantities.values
-    count = np.isfinite(values).sum(axis=0)
-    able = count >= max(min_fraction * len(values), 1)
-    if not able.any():
-        raise ValueError(
-            f"no texel with values of {min_fraction:.0%} of the {len(values)} subjects"
-        )
-    measured = np.where(able, values, np.float32(np.nan))
-    test = contrast_test(contrast, measured, max_draws, rng)
-    statistics = {
-        variables.MAP_EFFECT: test.effects.slope,
-        variables.MAP_EFFECT_HALF_WIDTH: (test.effects.high - test.effects.low) / 2,
-        variables.MAP_EFFECT_P: test.p,
-        variables.MAP_EFFECT_P_ADJUSTED: test.p_adjusted,
-    }
-    single = {name: np.float32(part) for name, part in statistics.items()}
-    return single | {variables.MAP_EFFECT_COUNT: count}, test.permutations
 
 
 def tabulate_effect_maps(maps: xr.Dataset) -> Table:
@@ -419,7 +341,7 @@ class Parameters(ContrastParameters):
 
 def compute(population: Population, parameters: Parameters) -> Results:
     """The results of the study."""
-    maps = effect_maps(population.cohort, **contrast_arguments(population, parameters))
+    maps = effect_maps(population.cohort, **contrast_arguments(parameters))
     return {"effect_maps": maps}
 
 

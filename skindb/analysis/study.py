@@ -120,8 +120,6 @@ class Population:
         Name -> (2,) mean position in the common (u, v) of the registered takes.
     registered
         Takes that are registered.
-    mixed_fits
-        Accept takes that were fitted with different parameters.
     notes
         Notes on the registration, to which a study may append.
     """
@@ -131,7 +129,6 @@ class Population:
     brdf_tables: Callable[[], Array | Delayed]
     landmarks: Mapping[str, Array] = field(default_factory=dict)
     registered: Sequence[str] = ()
-    mixed_fits: bool = False
     notes: list[Note] = field(default_factory=list)
 
 

@@ -11,11 +11,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from skindb.errors import Fault, InputError, input_error
+from skindb.numerics.statistics import Moments
 from skindb.schema.notes import Note, note
 from skindb.types import Array, Mask
 
@@ -210,6 +212,35 @@ def takes_to_compare(
             "group by condition, or add takes in the condition normal",
         )
     return cohort.isel(take=rows), subjects.select(rows)
+
+
+@dataclass(frozen=True)
+class Groups:
+    """Takes that are compared, and those of each group."""
+
+    takes: xr.Dataset
+    subject: tuple[str, ...]  # of each take
+    members: dict[str, list[int]]  # sorted names of the groups -> rows of their takes
+    attrs: dict[str, Any]  # of a table of the groups
+
+    def moments(self, values: Array) -> Moments:
+        """Moments (group, ...) of values (take, ...)."""
+        members = self.members.values()
+        return Moments.stacked(Moments.of(values[rows]) for rows in members)
+
+
+def grouped(cohort: xr.Dataset, group_by: str | None) -> Groups:
+    """The groups of a comparison; see `takes_to_compare` and `groups_by`."""
+    takes, subjects = takes_to_compare(cohort, group_by)
+    members: dict[str, list[int]] = {}
+    for row, name in enumerate(groups_by(subjects, group_by)):
+        members.setdefault(name, []).append(row)
+    attrs = {
+        "takes": sorted(subjects.take),
+        "group_by": group_by or "",
+        "skipped": list(cohort.attrs.get("skipped", [])),
+    }
+    return Groups(takes, subjects.subject, dict(sorted(members.items())), attrs)
 
 
 def level_error(takes: xr.Dataset) -> float:

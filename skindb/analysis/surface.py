@@ -44,7 +44,7 @@ from skindb.parameters import (
 )
 from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, stored_brdf
 from skindb.schema import dataset, variables
-from skindb.schema.cohort import require_same_fit
+from skindb.schema.cohort import require_comparable
 from skindb.threads import c_contiguous
 from skindb.types import AnyArray, Array, Mask
 
@@ -91,7 +91,6 @@ def brdf_space(
     tables: Array | Delayed,
     group_by: str,
     permutations: int = 10_000,
-    mixed_fits: bool = False,
     rng: np.random.Generator,
 ) -> xr.Dataset:
     """Mean surface BRDFs of groups, distances between groups and between takes, and a
@@ -120,8 +119,6 @@ def brdf_space(
         compared.
     permutations
         Maximum number of permutations for p values; if there are fewer, all of them are used.
-    mixed_fits
-        Accept takes that were fitted with different parameters.
     rng
         Random generator of the permutations.
 
@@ -143,8 +140,7 @@ def brdf_space(
     ----------
     Anderson and Walsh 2013; Chung and Romano 2016; Westfall and Young 1993; Gower 1966 (the map).
     """
-    if not mixed_fits:
-        require_same_fit(cohort)
+    require_comparable(cohort, "tables")
     takes, named, flags = grouped_takes(cohort, group_by)
     coefficient = _coefficients(takes.take, basis)
     [(metric, brdf)] = each_item(
@@ -477,11 +473,8 @@ def compute(population: Population, parameters: Parameters) -> Results:
     grouped_takes(cohort, parameters.group_by)  # before anything is computed
     rng = np.random.default_rng(parameters.seed)
     tables = population.brdf_tables()
-    mixed = population.mixed_fits
     k = parameters.k
-    basis = population_basis(
-        population.cohort, tables=tables, k=k, mixed_fits=mixed, rng=rng
-    )
+    basis = population_basis(population.cohort, tables=tables, k=k, rng=rng)
     rank = basis.sizes["component"]
     if rank < k:
         raise input_error(
@@ -496,7 +489,6 @@ def compute(population: Population, parameters: Parameters) -> Results:
         tables=tables,
         group_by=parameters.group_by,
         permutations=parameters.permutations,
-        mixed_fits=mixed,
         rng=rng,
     )
     return {"population_basis": basis, "brdf_space": space}

@@ -25,8 +25,8 @@ from skindb.numerics.texture import (
     synthesise,
 )
 from skindb.schema import dataset, variables
-from skindb.schema.cohort import require_same_fit
-from skindb.schema.label import FACE
+from skindb.schema.cohort import require_comparable
+from skindb.schema.label import CHANNELS, FACE
 from skindb.types import Array, Mask, finite_rows
 
 SIZE = 1024  # texels along each side
@@ -56,7 +56,7 @@ def texel_regions(landmarks: Mapping[str, Array], size: int = SIZE) -> dict[str,
 
 
 def texture_statistics(
-    cohort: xr.Dataset, *, landmarks: Mapping[str, Array], mixed_fits: bool = False
+    cohort: xr.Dataset, *, landmarks: Mapping[str, Array]
 ) -> xr.Dataset:
     """Quantile functions of log albedo and of its bands, for every take and region.
 
@@ -75,8 +75,6 @@ def texture_statistics(
         ``db.cohort("maps", size=1024)``.
     landmarks
         Name -> (2,) position in the common (u, v), from which the regions are drawn.
-    mixed_fits
-        Accept takes that were fitted with different parameters.
 
     Returns
     -------
@@ -91,8 +89,7 @@ def texture_statistics(
     InputError
         If no texel of any take was measured.
     """
-    if not mixed_fits:
-        require_same_fit(cohort)
+    require_comparable(cohort, "maps")
     size = cohort.sizes["v"]
     masks = texel_regions(landmarks, size)
     names = list(masks)
@@ -127,7 +124,7 @@ def texture_statistics(
             "take": cohort["take"].values.tolist(),
             "region": names,
             "part": part_names(),
-            "channel": ["R", "G", "B"],
+            "channel": CHANNELS,
         },
         attrs={"skipped": skipped_takes(cohort)},
     )

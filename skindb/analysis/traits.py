@@ -15,6 +15,7 @@ import xarray as xr
 from skindb import plots
 from skindb.analysis.albedo import albedo_and_texture, quantiles
 from skindb.analysis.brdf import population_basis
+from skindb.analysis.quantities import trusted
 from skindb.analysis.study import (
     Population,
     Results,
@@ -39,9 +40,9 @@ from skindb.errors import Fault, InputError, input_error
 from skindb.numerics.inference import missing_patterns
 from skindb.numerics.statistics import known_mean
 from skindb.parameters import DICTIONARY_HELP, adjust_option, option, seed_option
-from skindb.schema import IDENTIFIED, dataset, variables
-from skindb.schema.cohort import require_same_fit
-from skindb.schema.label import FACE
+from skindb.schema import dataset, variables
+from skindb.schema.cohort import require_comparable
+from skindb.schema.label import CHANNELS, FACE
 from skindb.types import Array, Mask, finite_rows, float64
 
 if TYPE_CHECKING:
@@ -84,7 +85,6 @@ def trait_vectors(
     texture: xr.Dataset | None = None,
     traits: Sequence[str] | None = None,
     adjust: Sequence[str] = (),
-    mixed_fits: bool = False,
     rng: np.random.Generator | None = None,
 ) -> xr.Dataset:
     """Shifts of surface BRDF, albedo histograms and translucency that are associated with traits.
@@ -105,8 +105,6 @@ def trait_vectors(
     adjust
         Attributes for which comparisons between subjects are adjusted; subjects without
         them are excluded.
-    mixed_fits
-        Accept takes that were fitted with different parameters.
     rng
         Random generator of the bootstrap over subjects; by default with seed 0.
 
@@ -127,8 +125,7 @@ def trait_vectors(
         If no take or every take has a trait, if a trait is determined by the attributes
         in `adjust`, or if the takes were fitted with different parameters.
     """
-    if not mixed_fits:
-        require_same_fit(cohort)
+    require_comparable(cohort, "tables")
     subjects = subjects_of(cohort)
     numbers = numeric_attributes(subjects)
     split = _split_takes(subjects, traits, numbers)
@@ -153,7 +150,7 @@ def trait_vectors(
             "trait": list(units),
             "side": list(SIDES),
             "region": albedo["region"].values,
-            "channel": ["R", "G", "B"],
+            "channel": CHANNELS,
             **part,
         },
         attrs={
@@ -429,9 +426,8 @@ def _log_sigma_tr(cohort: xr.Dataset) -> Array:
     """Log sigma_tr (take, site, channel) of all sites; NaN where a take has no trusted value."""
     if variables.SITE_SIGMA_TR not in cohort:
         return np.full((cohort.sizes["take"], 1, 3), np.nan)
-    node = cohort[[variables.SITE_SIGMA_TR, variables.SITE_STATUS]].load()
-    good = node[variables.SITE_STATUS].isin(IDENTIFIED)
-    return np.log(float64(node[variables.SITE_SIGMA_TR].where(good).values))
+    sites = cohort[[variables.SITE_SIGMA_TR, variables.SITE_STATUS]].load()
+    return np.log(float64(trusted(sites, variables.SITE_SIGMA_TR).values))
 
 
 def describe_traits(traits: xr.Dataset) -> list[str]:
@@ -547,13 +543,11 @@ class Parameters:
 def compute(population: Population, parameters: Parameters) -> Results:
     """The results of the study."""
     rng = np.random.default_rng(parameters.seed)
-    mixed = population.mixed_fits
     basis = population_basis(
         population.cohort,
         tables=population.brdf_tables(),
         k=parameters.k,
         in_metric=parameters.in_metric,
-        mixed_fits=mixed,
         rng=rng,
     )
     colours = albedo_and_texture(population)
@@ -563,7 +557,6 @@ def compute(population: Population, parameters: Parameters) -> Results:
         albedo=colours["albedo"],
         texture=colours.get("texture"),
         adjust=parameters.adjust,
-        mixed_fits=mixed,
         rng=rng,
     )
     return {"population_basis": basis, "traits": vectors, **colours}

@@ -11,31 +11,27 @@ from numpy.typing import NDArray
 
 from skindb import plots
 from skindb.analysis.contrasts import FEW
-from skindb.analysis.study import (
-    Population,
-    Results,
-    Study,
-    Table,
-    skipped_takes,
-    table_of,
-)
-from skindb.analysis.subjects import groups_by, takes_to_compare
-from skindb.numerics.statistics import Moments, variance_components
+from skindb.analysis.quantities import trusted
+from skindb.analysis.study import Population, Results, Study, Table, table_of
+from skindb.analysis.subjects import Groups, grouped
+from skindb.numerics.statistics import SUMMARY, known_mean, variance_components
 from skindb.parameters import group_option
-from skindb.schema import IDENTIFIED, ProbeStatus, dataset, variables
-from skindb.schema.cohort import require_same_fit, require_takes
+from skindb.schema import ProbeStatus, dataset, variables
+from skindb.schema.cohort import require_comparable
+from skindb.schema.label import CHANNELS
 from skindb.types import Array, float64
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-PROBED = variables.SITE_SIGMA_TR
+PROBED = (
+    variables.SITE_SIGMA_TR,
+    variables.SITE_SIGMA_TR_ERROR,
+    variables.SITE_SIGMA_TR_TOTAL_ERROR,
+    variables.SITE_STATUS,
+)
 COLUMNS = (
-    variables.SIGMA_TR_COUNT,
-    variables.SIGMA_TR_MEAN,
-    variables.SIGMA_TR_MEAN_LOW,
-    variables.SIGMA_TR_MEAN_HIGH,
-    variables.SIGMA_TR_STANDARD_DEVIATION,
+    *(f"sigma_tr_{name}" for name in SUMMARY),
     variables.SIGMA_TR_MEASUREMENT_ERROR,
     variables.SIGMA_TR_TOTAL_ERROR,
     variables.SIGMA_TR_PEOPLE_FRACTION,
@@ -44,7 +40,7 @@ COLUMNS = (
 
 
 def translucency_table(
-    cohort: xr.Dataset, *, group_by: str | None = None, mixed_fits: bool = False
+    cohort: xr.Dataset, *, group_by: str | None = None
 ) -> xr.Dataset:
     """Count, mean, standard deviation and variance of sigma_tr per site and channel,
     with 95 % intervals.
@@ -58,8 +54,6 @@ def translucency_table(
     group_by
         Attribute or trait to group by (condition, gender, gender:male, age:older, ...);
         None puts all takes into the group "all".
-    mixed_fits
-        Accept takes that were fitted with different parameters.
 
     Returns
     -------
@@ -84,59 +78,41 @@ def translucency_table(
         If the takes were fitted with different parameters, or if no take has the
         attribute `group_by`.
     """
-    require_takes(cohort, "tables")
-    if not mixed_fits:
-        require_same_fit(cohort)
-    takes, people = takes_to_compare(cohort, group_by)
-    groups = groups_by(people, group_by)
-    names = sorted(set(groups))
-    members = [np.flatnonzero([group == name for group in groups]) for name in names]
-    sites = takes["site"].values.tolist() if PROBED in takes else []
-    measured = _trusted(takes)
-    empty = np.full((takes.sizes["take"], len(sites), 3), np.nan)
-
-    def moments(name: str) -> Moments:
-        values = measured.get(name, empty)
-        return Moments.stacked(Moments.of(values[rows]) for rows in members)
-
-    subjects = np.array(people.subject)
-    sigma_tr = measured.get(PROBED, empty)
-    repeats = [_repeat_deviation(sigma_tr[rows], subjects[rows]) for rows in members]
-    noise = moments(variables.SITE_SIGMA_TR_ERROR)
+    require_comparable(cohort, "tables")
+    groups = grouped(cohort, group_by)
+    names = [name for name in PROBED if name in groups.takes]
+    takes = groups.takes[names].load()
+    sites = takes["site"].values.tolist() if PROBED[0] in takes else []
+    sigma_tr, noise, total = (
+        float64(trusted(takes, name).values)
+        if name in takes
+        else np.full((takes.sizes["take"], len(sites), 3), np.nan)
+        for name in PROBED[:3]
+    )
+    moments = groups.moments(sigma_tr)
+    variance = moments.variance
+    deviation_low, deviation_high = moments.deviation_interval()
+    measurement_error = _rms(groups, noise)
+    explained = measurement_error**2 / np.where(variance > 0, variance, np.nan)
+    subjects = np.array(groups.subject)
+    repeats = [
+        _repeat_deviation(sigma_tr[rows], subjects[rows])
+        for rows in groups.members.values()
+    ]
     return dataset(
         {
-            **_distribution(moments(PROBED), noise),
-            variables.SIGMA_TR_MEASUREMENT_ERROR: _rms(noise),
-            variables.SIGMA_TR_TOTAL_ERROR: _rms(
-                moments(variables.SITE_SIGMA_TR_TOTAL_ERROR)
-            ),
+            **moments.summary("sigma_tr"),
+            variables.SIGMA_TR_DEVIATION_LOW: deviation_low,
+            variables.SIGMA_TR_DEVIATION_HIGH: deviation_high,
+            variables.SIGMA_TR_VARIANCE: variance,
+            variables.SIGMA_TR_PEOPLE_FRACTION: np.clip(1 - explained, 0.0, 1.0),
+            variables.SIGMA_TR_MEASUREMENT_ERROR: measurement_error,
+            variables.SIGMA_TR_TOTAL_ERROR: _rms(groups, total),
             variables.SIGMA_TR_REPEAT_DEVIATION: np.stack(repeats),
         },
-        coords={"group": names, "site": sites, "channel": ["R", "G", "B"]},
-        attrs={
-            "takes": sorted(map(str, takes["take"].values)),
-            "group_by": group_by or "",
-            "statuses": _statuses(takes),
-            "skipped": skipped_takes(cohort),
-        },
+        coords={"group": [*groups.members], "site": sites, "channel": CHANNELS},
+        attrs=groups.attrs | {"statuses": _statuses(takes)},
     )
-
-
-def _distribution(values: Moments, noise: Moments) -> dict[str, Array]:
-    """Count, mean and spread of sigma_tr, and the fraction that noise does not explain."""
-    low, high = values.mean_interval()
-    deviation_low, deviation_high = values.deviation_interval()
-    return {
-        variables.SIGMA_TR_COUNT: values.count,
-        variables.SIGMA_TR_MEAN: np.where(values.count > 0, values.mean, np.nan),
-        variables.SIGMA_TR_MEAN_LOW: low,
-        variables.SIGMA_TR_MEAN_HIGH: high,
-        variables.SIGMA_TR_STANDARD_DEVIATION: values.standard_deviation,
-        variables.SIGMA_TR_DEVIATION_LOW: deviation_low,
-        variables.SIGMA_TR_DEVIATION_HIGH: deviation_high,
-        variables.SIGMA_TR_VARIANCE: values.variance,
-        variables.SIGMA_TR_PEOPLE_FRACTION: _people_fraction(values.variance, noise),
-    }
 
 
 def describe_translucency(table: xr.Dataset) -> list[str]:
@@ -163,27 +139,6 @@ def describe_translucency(table: xr.Dataset) -> list[str]:
     return lines
 
 
-def _trusted(takes: xr.Dataset) -> dict[str, Array]:
-    """Variables (take, site, channel) of trusted fits; NaN where a take lacks a site or
-    its fit is not trusted.
-    """
-    if PROBED not in takes:  # the probe was not used
-        return {}
-    names = (
-        PROBED,
-        variables.SITE_SIGMA_TR_ERROR,
-        variables.SITE_SIGMA_TR_TOTAL_ERROR,
-        variables.SITE_STATUS,
-    )
-    node = takes[[name for name in names if name in takes]].load()
-    good = node[variables.SITE_STATUS].isin(IDENTIFIED)
-    return {
-        str(name): float64(node[name].where(good).values)
-        for name in node
-        if name != names[-1]
-    }
-
-
 def _statuses(takes: xr.Dataset) -> dict[str, int]:
     """Number of profiles of each status."""
     if variables.SITE_STATUS not in takes:
@@ -197,18 +152,6 @@ def _statuses(takes: xr.Dataset) -> dict[str, int]:
         for name, count in counts.items()
         if count and name != ProbeStatus.NOT_MEASURED.name.lower()
     }
-
-
-def _people_fraction(variance: Array, errors: Moments) -> Array:
-    """Fraction of a variance that measurement errors do not explain; NaN where the
-    variance is 0 or unknown.
-    """
-    noise = _rms(errors) ** 2
-    return np.where(
-        variance > 0,
-        np.clip(1 - noise / np.where(variance > 0, variance, 1.0), 0.0, 1.0),
-        np.nan,
-    )
 
 
 def _repeat_deviation(values: Array, subjects: NDArray[np.str_]) -> Array:
@@ -226,9 +169,10 @@ def _repeat_deviation(values: Array, subjects: NDArray[np.str_]) -> Array:
     return out
 
 
-def _rms(moments: Moments) -> Array:
-    square = moments.mean**2 + moments.second / np.maximum(moments.count, 1)
-    return np.where(moments.count > 0, np.sqrt(square), np.nan)
+def _rms(groups: Groups, errors: Array) -> Array:
+    """Root mean square (group, site, channel) of errors (take, site, channel)."""
+    members = groups.members.values()
+    return np.stack([np.sqrt(known_mean(errors[rows] ** 2)) for rows in members])
 
 
 def plot_translucency(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
@@ -286,7 +230,6 @@ def compute(population: Population, parameters: Parameters) -> Results:
     table = translucency_table(
         population.cohort,
         group_by=parameters.group_by,
-        mixed_fits=population.mixed_fits,
     )
     return {"translucency_table": table}
 

@@ -14,13 +14,7 @@ import click
 
 import skindb
 from skindb.limits import MAX_SEED, MAX_WAIT_S, MAX_WORKERS
-from skindb.parameters import (
-    DICTIONARY_HELP,
-    Option,
-    broken_rule,
-    option_of,
-    words_of,
-)
+from skindb.parameters import DICTIONARY_HELP, Option, broken_rule, option_of, words_of
 
 DB = click.argument("db", metavar="DB")
 PATH = click.Path(path_type=Path)

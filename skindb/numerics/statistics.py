@@ -14,6 +14,7 @@ from scipy import optimize, stats
 from skindb.types import AnyArray, Array, float64
 
 CONFIDENCE = 0.95  # of intervals
+SUMMARY = ("count", "mean", "mean_low", "mean_high", "standard_deviation")
 POWER = 0.8  # of tests, for the smallest effect that they detect
 # standard deviation over the median absolute deviation of normal noise
 NORMAL_PER_MEDIAN = 1.4826
@@ -81,6 +82,15 @@ class Moments:
     def standard_deviation(self) -> Array:
         """Square root of the unbiased variance."""
         return np.sqrt(self.variance)
+
+    def summary(self, prefix: str) -> dict[str, Array]:
+        """Name of each statistic in `SUMMARY` after a prefix -> its values; NaN where
+        there are too few.
+        """
+        mean = np.where(self.count > 0, self.mean, np.nan)
+        values = (self.count, mean, *self.mean_interval(), self.standard_deviation)
+        names = [f"{prefix}_{name}" for name in SUMMARY]
+        return dict(zip(names, values, strict=True))
 
     def mean_interval(self) -> tuple[Array, Array]:
         """Student's interval of the mean; NaN for fewer than two values."""

@@ -280,6 +280,13 @@ def require_takes(cohort: xr.Dataset, layout: str) -> None:
         )
 
 
+def require_comparable(cohort: xr.Dataset, layout: str) -> None:
+    """`require_takes`, and `require_same_fit` unless the attribute ``mixed_fits`` is set."""
+    require_takes(cohort, layout)
+    if not cohort.attrs.get("mixed_fits"):
+        require_same_fit(cohort)
+
+
 def require_same_fit(cohort: xr.Dataset) -> None:
     """Raise `InputError` if takes of a cohort were fitted with different parameters.
 

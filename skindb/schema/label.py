@@ -13,6 +13,7 @@ from skindb.schema.declaration import flag_attrs
 from skindb.schema.variables import VARIABLES
 
 BLOCK_SURFELS = 4096  # of a task of a fit; objects hold multiples of it
+CHANNELS = ("R", "G", "B")
 FACE = "face"  # every surfel of a take
 # attributes of a capture that its models and their edits have too
 TAKE_ATTRS = ("subject", "condition", "session", "traits", "consent_scope", "take")

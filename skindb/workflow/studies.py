@@ -100,7 +100,8 @@ def open_population(
     if study.registers:
         require_covered(db, release)
     _require_models(db, takes, release)
-    open_models = partial(db.cohort, takes=takes or None, release=release)
+    opened = partial(_opened, db, release=release, mixed_fits=bool(takes))
+    open_models = partial(opened, takes=takes or None)
     if study.layout != "maps":
         cohort = open_models(study.layout, **study.cohort_options)
     else:
@@ -116,7 +117,7 @@ def open_population(
         notes = describe_registration(frames, cohort["take"].values.tolist())
         notes += [note("", origin)] if frames else []
     registered = [*registrations]
-    open_registered = partial(db.cohort, takes=registered, release=release)
+    open_registered = partial(opened, takes=registered)
 
     def open_cohort(layout: Any, **options: Any) -> xr.Dataset:
         if layout != "maps" and "kind" not in options:
@@ -135,10 +136,16 @@ def open_population(
         partial(_brdf_tables, open_models, cohort, dictionary),
         landmarks=common_landmarks(frames),
         registered=registered,
-        mixed_fits=bool(takes),
         notes=notes,
     )
     return population, [*_models(db, cohort), *registrations.values()]
+
+
+def _opened(
+    db: Database, layout: Any, *, mixed_fits: bool, **options: Any
+) -> xr.Dataset:
+    """A cohort that states whether its takes may be fitted with different parameters."""
+    return db.cohort(layout, **options).assign_attrs(mixed_fits=mixed_fits)
 
 
 def _require_models(db: Database, takes: Sequence[str], release: str | None) -> None:

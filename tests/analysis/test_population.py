@@ -116,10 +116,9 @@ def test_population_basis__one_dictionary():
         model.attrs["dictionary"] = "mine" if take == "B" else "embedded"
     with pytest.raises(InputError, match="one dictionary; found embedded, mine"):
         population_basis(
-            surfels(models),
+            surfels(models).assign_attrs(mixed_fits=True),
             tables=TABLES,
             k=2,
-            mixed_fits=True,
             rng=np.random.default_rng(0),
         )
 
