@@ -14,7 +14,6 @@ import numpy as np
 
 from skindb.calibration.lens import fit_vignette
 from skindb.calibration.response import fit_noise, recover_response
-from skindb.ingest.probe_profiles import compare_azimuths
 
 PICTURES = Path(__file__).parent / "pictures"
 BLACK = 1024.0
@@ -33,7 +32,6 @@ def main() -> None:
     draw_response(np.random.default_rng(1))
     draw_noise(np.random.default_rng(2))
     draw_residuals(np.random.default_rng(3))
-    draw_isotropy(np.random.default_rng(4))
 
 
 def encoded(exposure):
@@ -147,42 +145,6 @@ def draw_residuals(rng) -> None:
         ax.set_title(title)
         ax.set_axis_off()
     figure.savefig(PICTURES / "calibration_residuals.png", dpi=70)
-
-
-def draw_isotropy(rng) -> None:
-    """Draw sixteen profiles of isotropic and of anisotropic tissue, and their decay."""
-    distance = 1 + 0.5 * np.arange(28)
-    azimuth = 2 * np.pi * np.arange(16) / 16
-    figure, axes = plt.subplots(1, 2, figsize=(8, 3.3), layout="constrained")
-    for stretch, name in ((0.0, "isotropic"), (0.1, "10 % anisotropic")):
-        decay = 0.9 * (1 - stretch * np.cos(2 * (azimuth - 0.7)))
-        value = (np.exp(-decay[:, None] * distance) / distance**2)[..., None] * np.ones(
-            3
-        )
-        error = 0.05 * value
-        found = compare_azimuths(
-            value + error * rng.standard_normal(value.shape), error, distance, azimuth
-        )
-        colour = "C1" if stretch else "C0"
-        axes[0].semilogy(distance, value[..., 1].T, color=colour, lw=0.7)
-        label = (
-            f"{name}: p = {found.p_value[1]:.2g}, ratio {found.anisotropy[1]:.3f} ± "
-            f"{found.anisotropy_error[1]:.3f}"
-        )
-        axes[1].errorbar(
-            np.degrees(azimuth),
-            found.slope[:, 1],
-            found.slope_error[:, 1],
-            fmt="o",
-            color=colour,
-            label=label,
-        )
-    axes[0].set(xlabel="distance [mm]", ylabel="R, arbitrary unit")
-    axes[1].set(
-        xlabel="azimuth [degrees]", ylabel="decay minus mean [1/mm]", ylim=(-0.13, 0.2)
-    )
-    axes[1].legend(loc="upper center", fontsize=8)
-    figure.savefig(PICTURES / "calibration_isotropy.png", dpi=80)
 
 
 if __name__ == "__main__":
