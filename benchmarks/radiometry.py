@@ -51,11 +51,11 @@ def radiance_biases(capture, folder):
         for c in dome.cameras
         for light in dome.lights
     ]
-    response = recover_response(
+    table = recover_response(
         np.concatenate(views, axis=1), seconds, black=sensor.black, white=sensor.white
     )
     biases = []
-    for variant in (sensor, replace(sensor, response=response.table)):
+    for variant in (sensor, replace(sensor, response=table)):
         merged = []
         truth = []
         for path in sorted(folder.glob("*.exr")):

@@ -14,7 +14,6 @@ from skimage.io import imread
 
 from skindb.calibration.lights import ball_outline, distant_light, highlight_centre
 from skindb.calibration.response import (
-    ResponseOptions,
     recover_response,
     response_samples,
 )
@@ -78,7 +77,7 @@ def _memorial(folder: Path) -> tuple[Array, Array]:
 
 
 def _skindb(frames: Array, seconds: Array) -> Array:
-    return recover_response(frames, seconds, black=0, white=1).table[:, 1:]
+    return recover_response(frames, seconds, black=0, white=1)[:, 1:]
 
 
 def _srgb() -> Array:
@@ -108,7 +107,7 @@ def _misfit(curve: Array, frames: Array, seconds: Array) -> Array:
     """
     result = []
     for channel in range(3):
-        samples = response_samples(frames[..., channel], seconds, ResponseOptions())
+        samples = response_samples(frames[..., channel], seconds)
         value = samples.value
         usable = samples.usable & (value > LIMITS[0]) & (value < LIMITS[1])
         several = usable.sum(axis=1) >= 2

@@ -65,7 +65,7 @@ def errors(form, seconds, noise):
         patches = np.exp(rng.uniform(np.log(0.01), np.log(300), (40, 40)))
         radiance = np.kron(patches, np.ones((8, 8)))[..., None] * np.ones(3)
         stack = photograph(radiance, seconds, form, noise, rng)
-        table = recover_response(stack, seconds, black=BLACK, white=WHITE).table
+        table = recover_response(stack, seconds, black=BLACK, white=WHITE)
         value = (table[:, 0] - BLACK) / (WHITE - BLACK)
         ratio = np.stack(
             [

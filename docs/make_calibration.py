@@ -63,7 +63,7 @@ def draw_response(rng) -> None:
     left.loglog(exposure, encoded(exposure), "k", lw=3, alpha=0.3, label="truth")
     for count, seconds in STACKS.items():
         stack = np.stack([photograph(radiance, s, rng) for s in seconds])
-        table = recover_response(stack, seconds, black=BLACK, white=WHITE).table
+        table = recover_response(stack, seconds, black=BLACK, white=WHITE)
         value = (table[:, 0] - BLACK) / (WHITE - BLACK)
         left.loglog(table[1:, 2], value[1:], lw=1, label=f"{count} exposures")
         error = np.interp(encoded(exposure), value, table[:, 2]) / exposure
@@ -97,12 +97,14 @@ def draw_noise(rng) -> None:
                 WHITE,
             )
         )
-    fit = fit_noise(np.array(pairs), black=BLACK, white=WHITE, step=16.0)
+    frames = np.array(pairs)
+    fit = fit_noise(frames, black=BLACK, white=WHITE, step=16.0)
     figure, ax = plt.subplots(figsize=(5, 3.3), layout="constrained")
-    signal = fit.mean * fit.electrons_per_dn
+    signal = (frames.mean(axis=(1, 2, 3)) - BLACK) * fit.electrons_per_dn
+    deviation = (frames[:, 0] - frames[:, 1]).std(axis=(1, 2)) / np.sqrt(2)
     ax.loglog(
         np.maximum(signal, 1),
-        np.sqrt(fit.variance) * fit.electrons_per_dn,
+        deviation * fit.electrons_per_dn,
         "o",
         label="pairs of flat frames",
     )

@@ -69,16 +69,13 @@ UNKNOWN: Values = {
 
 @dataclass(frozen=True)
 class ColourFit:
-    """Colour matrix of the capture format, and CIEDE2000 differences (patch,) before and after it.
-
-    `error` (3, 3) is the standard error of the matrix by the scatter of the patches. A
-    patch that is not used has a NaN in the differences.
+    """Colour matrix of the capture format, its standard error (3, 3) by the scatter of
+    the patches, and their CIEDE2000 differences (patch,) after it; NaN if not used.
     """
 
     matrix: Float64
     error: Float64
-    delta_e_before: Float64
-    delta_e_after: Float64
+    delta_e: Float64
 
 
 def chart_reference() -> Float64:
@@ -113,17 +110,10 @@ def fit_colour_matrix(patches: ArrayLike) -> ColourFit:
     Raises
     ------
     InputError
-        Wrong shapes, too few usable patches, an unusable white patch, or patches of one colour.
+        Too few usable patches, an unusable white patch, or patches of one colour.
     """
     values = float64(patches)
     target = chart_reference()
-    require(
-        values.shape == target.shape,
-        "colour chart",
-        "its values must have the shape (patch, 3) of the reference",
-        f"{values.shape} and {target.shape}",
-        "give the patches row by row",
-    )
     good = finite_rows(values)
     white = int(target.sum(axis=1).argmax())
     usable = good.sum() >= MIN_PATCHES and good[white] and values[white, 1] > 0
@@ -139,11 +129,9 @@ def fit_colour_matrix(patches: ArrayLike) -> ColourFit:
     camera = values[good] * scale
     solution, error = _least_squares(camera, target[good])
     level = float(camera[good[:white].sum()] @ solution[:, 1]) / target[white, 1]
-    before = np.full(len(values), np.nan)
-    after = np.full(len(values), np.nan)
-    before[good] = _difference(camera, target[good])
-    after[good] = _difference(camera @ solution, target[good])
-    return ColourFit(solution.T / level, error / level, before, after)
+    difference = np.full(len(values), np.nan)
+    difference[good] = _difference(camera @ solution, target[good])
+    return ColourFit(solution.T / level, error / level, difference)
 
 
 def _least_squares(camera: Float64, target: Float64) -> tuple[Float64, Float64]:
@@ -301,16 +289,14 @@ def _response(
 ) -> tuple[CameraRecord, Values]:
     sets = frames.read(kind.frames, camera, frames.exposures)
     sensor = camera.sensor
-    response = recover_response(
+    table = recover_response(
         np.stack([repeats[0] for repeats in sets]),
         [*frames.exposures.values()],
         black=sensor.black,
         white=sensor.white,
     )
-    sensor = replace(sensor, response=response.table, response_file=None)
-    return replace(camera, sensor=sensor), {
-        "calibrated_response": response.table[:, 1:]
-    }
+    sensor = replace(sensor, response=table, response_file=None)
+    return replace(camera, sensor=sensor), {"calibrated_response": table[:, 1:]}
 
 
 def _flat(
@@ -371,7 +357,7 @@ def _chart(
     return replace(camera, colour_matrix=fit.matrix), {
         "calibrated_colour_matrix": fit.matrix,
         "calibrated_colour_matrix_error": fit.error,
-        "chart_difference": float(np.nanmedian(fit.delta_e_after)),
+        "chart_difference": float(np.nanmedian(fit.delta_e)),
     }
 
 
@@ -391,19 +377,20 @@ def _edge(
 
 def _reprojection(points: KnownPoints, camera: CameraRecord) -> Values:
     error = reprojection_error(points.position, points.pixel, camera)
+    rms = float(np.sqrt(np.mean(error**2)))
     width = camera.pixel_width(points.position.mean(axis=0))
     limit = float(np.clip(MAX_REPROJECTION_MM / width, *MAX_REPROJECTIONS_PX))
     require(
-        not error.rms > limit,
+        not rms > limit,
         "known points",
         f"known points must be seen within {limit:.2g} px of their projections "
         "(root mean square)",
-        f"{error.rms:.3g} px, {error.rms * width:.2g} mm at their distance; at "
-        f"most {error.largest:.3g} px",
+        f"{rms:.3g} px, {rms * width:.2g} mm at their distance; at "
+        f"most {error.max():.3g} px",
         "calibrate K, R, t and distortion of the camera again, or correct "
         "positions and pixels of the points",
     )
-    return {"reprojection_rms": error.rms, "reprojection_max": error.largest}
+    return {"reprojection_rms": rms, "reprojection_max": float(error.max())}
 
 
 def _merged(frames: CalibrationFrames, template: str, camera: CameraRecord) -> Float32:
@@ -423,32 +410,18 @@ STEPS: dict[str, Step] = {
 }
 
 
-@dataclass(frozen=True)
-class Reprojection:
-    """Residual (point, 2) px, observed minus predicted; its root mean square and
-    maximum in px; number of points.
-    """
-
-    residual: Float64
-    rms: float
-    largest: float
-    count: int
-
-
 def reprojection_error(
     points: ArrayLike, pixels: ArrayLike, camera: Pinhole
-) -> Reprojection:
-    """Distance of observed pixels (point, 2) from the projections of known points (point, 3) in mm.
-
-    Points that are behind the camera, or that were not observed (NaN), are excluded.
+) -> Float64:
+    """Distances (m,) in px of observed pixels (n, 2) from the projections of known points
+    (n, 3) in mm, without points behind the camera.
 
     Raises
     ------
     InputError
         No point remains.
     """
-    residual = float64(pixels) - camera.project(points)
-    length = lengths(residual)
+    length = lengths(float64(pixels) - camera.project(points))
     observed = length[np.isfinite(length)]
     require(
         len(observed),
@@ -457,5 +430,4 @@ def reprojection_error(
         f"none of {len(length)}",
         "check the pose of the camera",
     )
-    rms = float(np.sqrt(np.mean(observed**2)))
-    return Reprojection(residual, rms, float(observed.max()), len(observed))
+    return observed

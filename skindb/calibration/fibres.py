@@ -11,7 +11,7 @@ from scipy import ndimage, optimize
 
 from skindb.calibration.frame_checks import compared_exposures, disagreement
 from skindb.calibration.radiance import Image, merge_exposures
-from skindb.calibration.setup import MIN_FLAT_FRAMES, of_devices
+from skindb.calibration.setup import of_devices
 from skindb.errors import Fault, InputError, attempt, require
 from skindb.format.contact_probe import ProbeRecord
 from skindb.format.frames import Digests, Frame, read_frame, read_frames
@@ -165,17 +165,17 @@ def calibrate_probe(flat: ProbeRecord) -> xr.Dataset:
     """
     picture = np.mean([_green(flat, site) for site in flat.sites], axis=0)
     spots = find_fibres(picture, count=len(flat.fibres))
-    offsets = match_fibres(spots, Spots(flat.centre, flat.radius))
-    moved = replace(flat, centre=flat.centre + offsets.offset)
+    offset, order = match_fibres(spots, Spots(flat.centre, flat.radius))
+    moved = replace(flat, centre=flat.centre + offset)
     signals = [placement_signal(moved, site)[0] for site in flat.sites]
-    relative = fibre_gain(np.stack(signals))
+    gain, error = fibre_gain(np.stack(signals))
     level = flat.gain.mean(axis=0)
     return dataset(
         {
             "calibrated_fibre_centre": moved.centre,
-            "fibre_spot_radius": spots.radius[offsets.order],
-            "calibrated_fibre_gain": relative.gain * level,
-            "calibrated_fibre_gain_error": relative.error * level,
+            "fibre_spot_radius": spots.radius[order],
+            "calibrated_fibre_gain": gain * level,
+            "calibrated_fibre_gain_error": error * level,
         },
         coords={
             "fibre": list(flat.fibres),
@@ -231,24 +231,6 @@ class Spots:
     radius: Float64
 
 
-@dataclass(frozen=True)
-class SpotOffsets:
-    """Found minus given centres (fibre, 2) px, and index of the found spot (fibre,)."""
-
-    offset: Float64
-    order: Index
-
-
-@dataclass(frozen=True)
-class FibreGain:
-    """Flat field (fibre, 3), relative to the mean fibre of each channel, and its
-    standard error (fibre, 3).
-    """
-
-    gain: Float64
-    error: Float64
-
-
 def find_fibres(picture: ArrayLike, *, count: int) -> Spots:
     """Find the discs of the fibre faces in a picture of the probe on an evenly lit surface.
 
@@ -259,23 +241,16 @@ def find_fibres(picture: ArrayLike, *, count: int) -> Spots:
     Parameters
     ----------
     picture
-        (height, width) linear signal, without saturation.
+        (height, width) finite linear signal, without saturation.
     count
         Number of fibres.
 
     Raises
     ------
     InputError
-        The picture is not finite, or another number of spots is found.
+        Another number of spots is found.
     """
     grey = float64(picture)
-    require(
-        grey.ndim == 2 and np.isfinite(grey).all(),
-        "picture of the fibres",
-        "it must be finite and have the shape (height, width)",
-        str(grey.shape),
-        "give one channel of the merged brackets",
-    )
     dark = float(np.median(grey))
     noise = float(robust_deviation(grey - dark))
     level = dark + max(MIN_CONTRAST * noise, 0.05 * (float(grey.max()) - dark))
@@ -314,21 +289,19 @@ def _measure(
     )
 
 
-def match_fibres(spots: Spots, stated: Spots) -> SpotOffsets:
+def match_fibres(spots: Spots, stated: Spots) -> tuple[Float64, Index]:
     """Pair found with given fibres so that the sum of squared distances is smallest.
+
+    Returns
+    -------
+    offset, order : ndarray
+        Found minus given centres (fibre, 2) px, and index of the found spot (fibre,).
 
     Raises
     ------
     InputError
-        The numbers differ, or a fibre is farther from its given position than its radius.
+        A fibre is farther from its given position than its radius.
     """
-    require(
-        len(spots.radius) == len(stated.radius),
-        "fibres",
-        "as many fibres must be found as are given",
-        f"{len(spots.radius)} and {len(stated.radius)}",
-        "compare probe.json with the picture",
-    )
     square = ((stated.centre[:, None] - spots.centre) ** 2).sum(axis=-1)
     _, order = optimize.linear_sum_assignment(square)
     offset = spots.centre[order] - stated.centre
@@ -341,10 +314,10 @@ def match_fibres(spots: Spots, stated: Spots) -> SpotOffsets:
         f"{count} farther away, up to {distance.max():.1f} px",
         "correct the centres",
     )
-    return SpotOffsets(offset, np.asarray(order, int))
+    return offset, np.asarray(order, int)
 
 
-def fibre_gain(signal: ArrayLike) -> FibreGain:
+def fibre_gain(signal: ArrayLike) -> tuple[Float64, Float64]:
     """Flat field from repeated frames of an evenly lit surface that is moved between the frames.
 
     The logarithm of the signal is modelled as a level of the frame plus a level of the
@@ -354,27 +327,29 @@ def fibre_gain(signal: ArrayLike) -> FibreGain:
     Parameters
     ----------
     signal
-        (frame, fibre, 3) mean signal of each fibre.
+        (frame, fibre, 3) mean signal of each fibre, of several frames.
+
+    Returns
+    -------
+    gain, error : ndarray
+        (fibre, 3) relative to the mean fibre of each channel, and its standard error.
 
     Raises
     ------
     InputError
-        Too few frames, or signals that are not positive and finite.
+        Signals that are not positive and finite.
     """
     values = float64(signal)
-    shaped = values.ndim == 3 and values.shape[2] == 3 and values.shape[1] > 1
+    lost = ~(values > 0)  # also if NaN
     require(
-        shaped
-        and len(values) >= MIN_FLAT_FRAMES
-        and (np.isfinite(values) & (values > 0)).all(),
+        not lost.any(),
         "flat field of the fibres",
-        "its signals must be positive, of the shape (frame, fibre, 3), and of "
-        f"{MIN_FLAT_FRAMES} frames or more",
-        f"an array of {values.shape}",
-        "use brackets in which no fibre is dark or saturated, and repeat the frames",
+        "no fibre may be dark, or saturated in all brackets",
+        f"{lost.any(axis=(0, 2)).sum()} of {values.shape[1]} fibres are",
+        "use other brackets, and repeat the frames",
     )
     log = np.log(values)
     log -= log.mean(axis=1, keepdims=True)
     gain = np.exp(log.mean(axis=0))
     gain /= gain.mean(axis=0)
-    return FibreGain(gain, gain * log.std(axis=0, ddof=1) / np.sqrt(len(log)))
+    return gain, gain * log.std(axis=0, ddof=1) / np.sqrt(len(log))

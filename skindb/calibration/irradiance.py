@@ -249,7 +249,7 @@ class LightFit:
 
     The errors are standard errors; that of the exponent is part of those of the
     intensity. `used` is the fraction of the usable pixels that are neither shadowed nor
-    dirty, `scatter` the relative standard deviation of these.
+    dirty.
     """
 
     intensity: Float64
@@ -257,7 +257,6 @@ class LightFit:
     falloff: float
     falloff_error: float
     used: float
-    scatter: float
 
 
 def position_sensitivity(target: TargetPixels, *, falloff: float) -> float:
@@ -313,20 +312,12 @@ def fit_light(target: TargetPixels, *, falloff: float | None = None) -> LightFit
     Raises
     ------
     InputError
-        Wrong shapes, too few usable pixels, or more than half of them in shadow.
+        Too few usable pixels, or more than half of them in shadow.
     """
-    radiance = float64(target.radiance)
-    require(
-        radiance.shape == np.shape(target.points) == (len(radiance), 3),
-        "white target",
-        "radiance and points must have the shape (pixel, 3)",
-        f"{radiance.shape} and {np.shape(target.points)}",
-        "give one row for each pixel of the target",
-    )
     distance, lit, angle = _light_geometry(target, target.position)
     with np.errstate(invalid="ignore", divide="ignore"):
         factor = distance**2 / (target.reflectance * lit)
-        value = np.log(np.pi * radiance * factor[:, None])
+        value = np.log(np.pi * target.radiance * factor[:, None])
         slope = np.log(angle)
     good = (lit > MIN_COSINE) & (angle > MIN_COSINE) & finite_rows(value)
     require(
@@ -367,7 +358,6 @@ def _fit(value: Float64, slope: Float64, falloff: float | None) -> LightFit:
         exponent,
         float(exponent_error),
         inlier_fraction,
-        float(residual.std()),
     )
 
 

@@ -29,19 +29,13 @@ class EdgeFit:
     """Blur of an edge: standard deviation in px, which includes the aperture of the
     pixel, with its standard error.
 
-    `dark` and `bright` are the levels beside the edge, and `mtf50` the frequency in cycles
-    per px at which a Gaussian of this width halves the contrast.
+    `dark` and `bright` are the levels beside the edge.
     """
 
     blur: float
     blur_error: float
     dark: float
     bright: float
-
-    @property
-    def mtf50(self) -> float:
-        """Cycles per px at which exp(-2 (pi f sigma)^2) is one half."""
-        return float(np.sqrt(np.log(2) / 2) / (np.pi * self.blur))
 
 
 def fit_edge(picture: ArrayLike) -> EdgeFit:
@@ -64,7 +58,7 @@ def fit_edge(picture: ArrayLike) -> EdgeFit:
     """
     grey = float64(picture)
     require(
-        grey.ndim == 2 and min(grey.shape) >= 16 and np.isfinite(grey).all(),
+        min(grey.shape) >= 16 and np.isfinite(grey).all(),
         "slanted edge",
         "its picture must be finite and have 16 px or more on each side",
         str(grey.shape),
@@ -115,19 +109,7 @@ def veiling_glare(edge: EdgeFit, *, mean: float, contrast: float = 0.0) -> float
         Mean signal of the frame, in the same unit.
     contrast
         Reflectance of the dark surface over that of the bright one; 0 for a light trap.
-
-    Raises
-    ------
-    InputError
-        `mean` is not positive, or `contrast` is not in [0, 1).
     """
-    require(
-        mean > 0 and 0 <= contrast < 1,
-        "veiling glare",
-        "the mean must be positive, and the contrast at least 0 and below 1",
-        f"{mean:g} and {contrast:g}",
-        "measure both on linear frames",
-    )
     return (edge.dark - contrast * edge.bright) / (mean * (1 - contrast))
 
 
@@ -176,16 +158,12 @@ def _require_edge(satisfied: object, finding: str) -> None:
 @dataclass(frozen=True)
 class Vignette:
     """Coefficients a2, a4, a6 of 1 + a2 r^2 + a4 r^4 + a6 r^6, their covariance (3, 3),
-    and the residual.
-
-    `residual` is the relative root mean square deviation of the frame from the fit;
-    `used` is the fraction of the finite pixels that are not outliers.
+    and the relative root mean square deviation of the frame from the fit.
     """
 
     coefficients: Float64
     covariance: Float64
     residual: float
-    used: float
 
 
 def fit_vignette(flat: ArrayLike, centre: ArrayLike) -> Vignette:
@@ -210,13 +188,6 @@ def fit_vignette(flat: ArrayLike, centre: ArrayLike) -> Vignette:
     """
     picture = float64(flat)
     middle = float64(centre)
-    require(
-        picture.ndim == 2,
-        "flat frame",
-        "it must have the shape (height, width)",
-        str(picture.shape),
-        "fit one channel, or the mean of the channels",
-    )
     row, column = np.nonzero(np.isfinite(picture) & (picture > 0))
     half = np.hypot(*picture.shape) / 2
     x = (column + 0.5 - middle[0]) / half
@@ -242,8 +213,7 @@ def fit_vignette(flat: ArrayLike, centre: ArrayLike) -> Vignette:
     by_level = -coefficients[:, None] / level
     slope = np.hstack([by_level, np.zeros((3, 2)), np.eye(3) / level])
     covariance = slope @ inverse @ slope.T
-    inlier_fraction = float(inliers.mean())
-    return Vignette(coefficients, covariance, misfit / abs(level), inlier_fraction)
+    return Vignette(coefficients, covariance, misfit / abs(level))
 
 
 def _robust_fit(design: Float64, value: Float64) -> tuple[Float64, Float64, Mask]:

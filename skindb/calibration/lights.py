@@ -274,25 +274,17 @@ def light_position(origins: ArrayLike, directions: ArrayLike) -> LightPosition:
     Parameters
     ----------
     origins
-        (ray, 3) mm.
+        (ray, 3) mm, of two or more rays.
     directions
         (ray, 3) unit vectors.
 
     Raises
     ------
     InputError
-        Fewer than two rays, values that are not finite, or rays that are nearly parallel.
+        Rays that are nearly parallel.
     """
     start = float64(origins)
     way = float64(directions)
-    shaped = start.ndim == 2 and start.shape == way.shape and len(start) >= 2
-    require(
-        shaped and np.isfinite([start, way]).all(),
-        "light",
-        "its position needs two or more rays of finite numbers",
-        f"{start.shape} and {way.shape}",
-        "photograph the ball at another position",
-    )
     across = np.eye(3) - way[:, :, None] * way[:, None, :]
     weight = np.ones(len(start))
     for _ in range(ROUNDS):

@@ -6,14 +6,12 @@ frames (photon transfer; Janesick 2007), mean dark frame and defect pixels.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from skindb.errors import Fault, InputError, require
-from skindb.files import private_file
+from skindb.errors import require
 from skindb.numerics.statistics import robust_deviation
 from skindb.types import Float64, Index, Mask
 
@@ -47,6 +45,9 @@ FIRST_SMOOTHNESS = 1e-6
 # errors of the curve: with every fifth sample held out, no curve is too rough. Chosen
 # between 4 and 10 on simulated stacks; the published stacks confirm it
 FOLDS = 5
+KNOTS = 48
+SAMPLES = 1000  # blocks of BLOCK x BLOCK px
+BLOCK = 4
 MIN_SAMPLES = 50  # with two usable exposures; fewer would not cover the range of values
 MIN_RISE = 1e-9  # relative exposure between rows of the table, which must increase
 STRATA = 40  # classes of brightness with equally many samples
@@ -67,54 +68,9 @@ MAX_DEVIATIONS = 6.0
 NEIGHBOURHOOD = 5  # px; side of the median that a pixel is compared with
 
 
-@dataclass(frozen=True)
-class ResponseOptions:
-    """Options for the fit of a response.
-
-    `smoothness` is the weight of the integral of the squared second derivative of
-    ln(exposure / value) over the coordinate of the knots, relative to the mean squared
-    misfit; without a value, cross-validation chooses it. `knots` is the number of
-    knots, `samples` the number of blocks of `block` by `block` px.
-    """
-
-    smoothness: float | None = None
-    knots: int = 48
-    samples: int = 1000
-    block: int = 4
-
-
-@dataclass(frozen=True)
-class Response:
-    """A response, and measures of its accuracy.
-
-    `table` (row, 4) holds the values of the file and the relative exposures of red,
-    green and blue, from 0 at black to 1 at white. `residual` (3,) is the root mean
-    square of the misfit in natural logarithms, weighted as in the fit. `samples`
-    (3,) counts those that were used; beyond their values the response is extrapolated.
-    """
-
-    table: Float64
-    residual: Float64
-    samples: Index
-
-    @property
-    def nonlinearity(self) -> float:
-        """Largest difference of relative exposure from a linear response, which is
-        small for a linear sensor.
-        """
-        table = self.table
-        value = (table[:, :1] - table[0, 0]) / (table[-1, 0] - table[0, 0])
-        return float(np.abs(table[:, 1:] - value).max())
-
-
 def recover_response(
-    stack: ArrayLike,
-    seconds: ArrayLike,
-    *,
-    black: float,
-    white: float,
-    options: ResponseOptions | None = None,
-) -> Response:
+    stack: ArrayLike, seconds: ArrayLike, *, black: float, white: float
+) -> Float64:
     """Relative exposure as a function of the value, per channel.
 
     The method is that of Debevec and Malik (1997, eq. 3): ln f(value) = ln radiance +
@@ -129,69 +85,52 @@ def recover_response(
     Parameters
     ----------
     stack
-        (exposure, height, width, 3) values of the file; several views may be stacked
-        along the height.
+        (exposure, height, width, 3) finite values of the file; several views may be
+        stacked along the height.
     seconds
         (exposure,) exposure times in s, at least two different ones.
     black, white
         Levels in values of the file.
-    options
-        Weight of smoothness, numbers of knots and samples.
+
+    Returns
+    -------
+    ndarray
+        (row, 4) values of the file, and the relative exposures of red, green and blue,
+        from 0 at black to 1 at white. Beyond the values of the samples they are
+        extrapolated.
 
     Raises
     ------
     InputError
-        The stack has a wrong shape or non-finite values, or too few pixels are usable
-        in two exposures.
+        All times are equal, or too few pixels are usable in two exposures.
     """
-    options = options or ResponseOptions()
     frames = np.asarray(stack)
     times = np.asarray(seconds, float)
-    _require_stack(frames, times, (black, white), options.block)
-    channels = [
-        response_samples(
-            (frames[..., c].astype(float) - black) / (white - black),
-            times,
-            options,
-        )
-        for c in range(3)
-    ]
-    few = [
-        f"{colour} {len(samples.value)}"
-        for colour, samples in zip(("red", "green", "blue"), channels, strict=True)
-        if len(samples.value) < MIN_SAMPLES
-    ]
     require(
-        not few,
+        len(np.unique(times)) > 1,
+        STACK,
+        "at least two of the exposure times must be different",
+        np.array2string(times, threshold=8),
+        "photograph the scene with several times",
+    )
+    channels = [
+        response_samples((channel.astype(float) - black) / (white - black), times)
+        for channel in np.moveaxis(frames, -1, 0)
+    ]
+    counts = [len(samples.pixels) for samples in channels]
+    require(
+        min(counts) >= MIN_SAMPLES,
         STACK,
         f"at least {MIN_SAMPLES} blocks of pixels must be neither dark nor "
         "saturated in two exposures",
-        ", ".join(few),
+        "red {}, green {}, blue {}".format(*counts),
         "add exposures, or photograph a scene with more range",
     )
     # forced to rise from 0 at black to 1 at white
     value = np.linspace(0.0, 1.0, TABLE_ROWS)
-    fits = [_fit_channel(samples, options) for samples in channels]
-    rising = [_rising(_curve(value, ratio, options.knots)) for ratio, _, _ in fits]
-    return Response(
-        table=np.column_stack(
-            [black + value * (white - black), *(curve / curve[-1] for curve in rising)]
-        ),
-        residual=np.array([residual for _, residual, _ in fits]),
-        samples=np.array([count for _, _, count in fits], int),
-    )
-
-
-def write_response(path: Path, response: Response) -> None:
-    """Write the CSV `dn,r,g,b` of the capture format."""
-    np.savetxt(
-        private_file(path),
-        response.table,
-        fmt="%.10g",
-        delimiter=",",
-        header="dn,r,g,b",
-        comments="",
-    )
+    rising = [_rising(_curve(value, _fit_channel(samples))) for samples in channels]
+    exposures = (curve / curve[-1] for curve in rising)
+    return np.column_stack([black + value * (white - black), *exposures])
 
 
 def _place(value: Float64) -> Float64:
@@ -199,9 +138,9 @@ def _place(value: Float64) -> Float64:
     return np.asarray(np.arcsinh(value / TOE) / np.arcsinh(1 / TOE))
 
 
-def _curve(value: Float64, log_ratio: Float64, knots: int) -> Float64:
+def _curve(value: Float64, log_ratio: Float64) -> Float64:
     """Exposure (n,) of values (n,), up to a factor."""
-    ratio = np.interp(_place(value), np.linspace(0, 1, knots), log_ratio)
+    ratio = np.interp(_place(value), np.linspace(0, 1, KNOTS), log_ratio)
     return value * np.exp(ratio)
 
 
@@ -210,27 +149,17 @@ def _rising(curve: Float64) -> Float64:
     return np.asarray(np.maximum.accumulate(curve) + MIN_RISE * np.arange(len(curve)))
 
 
-def _fit_channel(
-    samples: ResponseSamples, options: ResponseOptions
-) -> tuple[Float64, float, int]:
-    """Log ratio of exposure to value at the knots, weighted residual, and number of
-    samples that did not move.
-    """
+def _fit_channel(samples: ResponseSamples) -> Float64:
+    """Log ratio of exposure to value at the knots."""
     value = samples.value
-    smoothness = options.smoothness
-    if smoothness is None:
-        smoothness = FIRST_SMOOTHNESS
     for _ in range(MEANS):
-        solution, _, _ = _fit_values(samples, value, smoothness, options.knots)
-        value = _mean_exposure_value(samples.pixels, solution, options.knots)
-    if options.smoothness is None:
-        smoothness = _cross_validated(samples, value, options.knots)
-    solution, misfit, still = _fit_values(samples, value, smoothness, options.knots)
-    residual = float(np.sqrt(np.mean(misfit[still] ** 2)))
-    return solution, residual, int(still.sum())
+        solution, _ = _fit_values(samples, value, FIRST_SMOOTHNESS)
+        value = _mean_exposure_value(samples.pixels, solution)
+    smoothness = _cross_validated(samples, value)
+    return _fit_values(samples, value, smoothness)[0]
 
 
-def _mean_exposure_value(pixels: Float64, log_ratio: Float64, knots: int) -> Float64:
+def _mean_exposure_value(pixels: Float64, log_ratio: Float64) -> Float64:
     """Value (sample, exposure) of the mean exposure of the pixels of each block, by a
     preliminary response.
 
@@ -238,7 +167,7 @@ def _mean_exposure_value(pixels: Float64, log_ratio: Float64, knots: int) -> Flo
     exposures are clipped at black.
     """
     grid = np.linspace(0.0, 1.0, MEAN_ROWS)
-    curve = _rising(_curve(grid, log_ratio, knots))
+    curve = _rising(_curve(grid, log_ratio))
     exposure = np.interp(pixels, grid, curve)
     mean = exposure.mean(axis=-1)
     usable = mean > MIN_SIGNAL_TO_NOISE * exposure.std(axis=-1)
@@ -247,15 +176,15 @@ def _mean_exposure_value(pixels: Float64, log_ratio: Float64, knots: int) -> Flo
 
 
 def _fit_values(
-    samples: ResponseSamples, value: Float64, smoothness: float, knots: int
-) -> tuple[Float64, Float64, Mask]:
-    """The fit to given values (sample, exposure): log ratios (knot,), weighted root mean
-    square misfit (sample,), and mask (sample,) of those that did not move.
+    samples: ResponseSamples, value: Float64, smoothness: float
+) -> tuple[Float64, Mask]:
+    """The fit to given values (sample, exposure): log ratios (knot,), and mask (sample,)
+    of the samples that did not move.
     """
-    design, target, weight = _equations(samples, value, knots)
+    design, target, weight = _equations(samples, value)
     chosen = np.ones(len(value), bool)
     for _ in range(ROUNDS):
-        rows = design[chosen].reshape(-1, knots)
+        rows = design[chosen].reshape(-1, KNOTS)
         heavy = weight[chosen].ravel()[:, None] / weight[chosen].sum()
         solution = _solve(
             rows.T @ (heavy * rows),
@@ -268,17 +197,17 @@ def _fit_values(
         if (still == chosen).all() or still.sum() < MIN_SAMPLES:
             break
         chosen = still
-    return solution, misfit, chosen
+    return solution, chosen
 
 
 def _equations(
-    samples: ResponseSamples, value: Float64, knots: int
+    samples: ResponseSamples, value: Float64
 ) -> tuple[Float64, Float64, Float64]:
     """Design (sample, exposure, knot), target and weight (sample, exposure)."""
     value = np.where(samples.usable, value, 0.5)
     hat = np.where(value < 0.5, value, np.maximum(1 - value, MIN_BRIGHT_WEIGHT))
     weight = np.where(samples.usable, hat, 0.0) ** 2
-    design = _knot_weights(value, knots)
+    design = _knot_weights(value)
     target = np.log(samples.seconds) - np.log(value)
     # subtracting the weighted mean eliminates the unknown radiance of a sample
     total = weight.sum(axis=1, keepdims=True)
@@ -289,21 +218,20 @@ def _equations(
 
 def _solve(normal: Float64, moment: Float64, smoothness: float) -> Float64:
     """Log ratios (..., knot) from normal equations (..., knot, knot) and (..., knot)."""
-    knots = moment.shape[-1]
-    bend = np.diff(np.eye(knots), 2, axis=0)
-    penalty = smoothness * (knots - 1) ** 3 * bend.T @ bend
+    bend = np.diff(np.eye(KNOTS), 2, axis=0)
+    penalty = smoothness * (KNOTS - 1) ** 3 * bend.T @ bend
     # fixes the free factor of the curve: 1 at white
-    anchor = np.eye(knots)[-1:]
+    anchor = np.eye(KNOTS)[-1:]
     whole = normal + penalty + anchor.T @ anchor
     return np.asarray(np.linalg.solve(whole, moment[..., None])[..., 0])
 
 
-def _cross_validated(samples: ResponseSamples, value: Float64, knots: int) -> float:
+def _cross_validated(samples: ResponseSamples, value: Float64) -> float:
     """The smoothness with which fits predict the ranges of brightness that they do not
     contain best.
     """
-    _, _, still = _fit_values(samples, value, FIRST_SMOOTHNESS, knots)
-    design, target, weight = _equations(samples, value, knots)
+    _, still = _fit_values(samples, value, FIRST_SMOOTHNESS)
+    design, target, weight = _equations(samples, value)
     root = np.sqrt(weight / weight[still].sum())
     rows = root[..., None] * design
     columns = root * target
@@ -323,15 +251,10 @@ def _cross_validated(samples: ResponseSamples, value: Float64, knots: int) -> fl
     return float(SMOOTHNESS[np.argmin(scores)])
 
 
-def _knot_weights(value: Float64, knots: int) -> Float64:
+def _knot_weights(value: Float64) -> Float64:
     """Weights (sample, exposure, knot) of linear interpolation between the knots."""
-    position = _place(value) * (knots - 1)
-    cell = np.minimum(position.astype(int), knots - 2)[..., None]
-    part = position[..., None] - cell
-    weights = np.zeros((*value.shape, knots))
-    np.put_along_axis(weights, cell, cell + 1 - position[..., None], axis=-1)
-    np.put_along_axis(weights, cell + 1, part, axis=-1)
-    return weights
+    position = _place(value)[..., None] * (KNOTS - 1)
+    return np.maximum(1 - np.abs(position - np.arange(KNOTS)), 0)
 
 
 @dataclass(frozen=True)
@@ -353,9 +276,7 @@ class ResponseSamples:
         return np.asarray(self.pixels.mean(axis=-1))
 
 
-def response_samples(
-    values: Float64, times: Float64, options: ResponseOptions
-) -> ResponseSamples:
+def response_samples(values: Float64, times: Float64) -> ResponseSamples:
     """Choose flat blocks of pixels that are spread over all brightnesses.
 
     Blocks are divided into classes of equal width of their mean value over all
@@ -366,12 +287,13 @@ def response_samples(
     `values` (exposure, height, width) are those of one channel, 0 black and 1 white;
     `times` (exposure,) in s.
     """
-    block = options.block
-    height, width = (side // block * block for side in values.shape[1:])
-    tiles = values[:, :height, :width].reshape(
-        len(times), height // block, block, width // block, block
+    rows, columns = (side // BLOCK for side in values.shape[1:])
+    tiles = values[:, : rows * BLOCK, : columns * BLOCK].reshape(
+        len(times), rows, BLOCK, columns, BLOCK
     )
-    tiles = tiles.transpose(1, 3, 0, 2, 4).reshape(-1, len(times), block * block)
+    tiles = tiles.transpose(1, 3, 0, 2, 4).reshape(
+        rows * columns, len(times), BLOCK * BLOCK
+    )
     mean = tiles.mean(axis=-1)
     usable = (mean >= MIN_VALUE) & (mean <= MAX_VALUE) & (tiles.max(axis=-1) < 1)
     enough = usable.sum(axis=1) >= 2
@@ -381,7 +303,7 @@ def response_samples(
     roughness = tiles.std(axis=-1) / np.maximum(mean, MIN_VALUE)
     rough = np.where(usable, roughness, 0).max(axis=1, initial=0)
     order = _flattest_first(rough, np.clip(mean, 0, 1).mean(axis=1))
-    chosen = order[: options.samples]
+    chosen = order[:SAMPLES]
     return ResponseSamples(tiles[chosen], usable[chosen], times)
 
 
@@ -398,53 +320,20 @@ def _flattest_first(rough: Float64, bright: Float64) -> Index:
     return order[np.argsort(rank, kind="stable")]
 
 
-def _require_stack(
-    frames: NDArray[np.generic], times: Float64, levels: tuple[float, float], block: int
-) -> None:
-    """Report every fault of the arguments at once."""
-    faults = list[Fault]()
-    if frames.ndim != 4 or frames.shape[-1] != 3 or times.shape != frames.shape[:1]:
-        rule = "it must have the shape (exposure, height, width, 3) and one time for each exposure"
-        finding = f"{frames.shape} and {times.shape}"
-        cure = "stack the frames along a new first axis"
-        faults.append(Fault(STACK, rule, finding, cure))
-    elif min(frames.shape[1:3]) < block:
-        rule = f"frames must be at least {block} px wide and high"
-        faults.append(Fault(STACK, rule, str(frames.shape)))
-    elif not np.isfinite(frames.astype(float)).all():
-        rule = "its values must be finite"
-        faults.append(Fault(STACK, rule, "NaN or infinity", "remove damaged frames"))
-    if not (np.isfinite(times) & (times > 0)).all() or len(np.unique(times)) < 2:
-        rule = "exposure times must be positive, and at least two of them different"
-        finding = np.array2string(times, threshold=8)
-        cure = "photograph the scene with several times"
-        faults.append(Fault(STACK, rule, finding, cure))
-    if not levels[0] < levels[1]:
-        rule = "the white level must be above the black level"
-        faults.append(Fault(STACK, rule, f"{levels[0]:g}, {levels[1]:g}"))
-    if faults:
-        raise InputError(faults)
-
-
 @dataclass(frozen=True)
 class NoiseModel:
     """Noise of a linear sensor: electrons per value and read noise in electrons, with
     their standard errors.
 
-    `covariance` (2, 2) is that of the variance at black and the variance per value, in
-    values of the file. `chi_square` is the chi-squared of the fit per degree of
-    freedom, about 1 if the sensor follows the model. `mean` and `variance` (pair,) are
-    the points of the curve; a pair that is clipped at the white level is NaN.
+    `chi_square` is the chi-squared of the fit per degree of freedom, about 1 if the
+    sensor follows the model.
     """
 
     electrons_per_dn: float
     electrons_per_dn_error: float
     read_noise: float
     read_noise_error: float
-    covariance: Float64
     chi_square: float
-    mean: Float64
-    variance: Float64
 
 
 def fit_noise(
@@ -471,23 +360,13 @@ def fit_noise(
     Raises
     ------
     InputError
-        Wrong shape, values that are not finite, too few unsaturated pairs, or pairs of
-        one brightness.
+        Too few unsaturated pairs, or pairs of one brightness.
     """
     frames = np.asarray(pairs, float)
-    shaped = frames.ndim == 4 and frames.shape[1] == 2 and frames[0, 0].size >= 100
-    require(
-        shaped and np.isfinite(frames).all(),
-        PAIRS,
-        "they must be finite, of the shape (pair, 2, height, width), and have 100 "
-        "pixels or more",
-        str(frames.shape),
-        "give one channel of each frame",
-    )
-    mean, variance = _transfer_curve(frames, black=black, white=white)
-    unclipped = np.isfinite(mean)
-    x = mean[unclipped]
-    y = variance[unclipped]
+    clipped = (frames >= white).mean(axis=(1, 2, 3)) > SATURATION_FRACTION
+    frames = frames[~clipped]
+    x = frames.mean(axis=(1, 2, 3)) - black
+    y = (frames[:, 0] - frames[:, 1]).var(axis=(1, 2), ddof=1) / 2
     require(
         len(x) >= MIN_PAIRS
         and x.max() >= MIN_RATIO * max(x.min(), 0.0)
@@ -513,24 +392,8 @@ def fit_noise(
         electrons_per_dn_error=gain**2 * float(np.sqrt(covariance[1, 1])),
         read_noise=noise,
         read_noise_error=noise_error,
-        covariance=covariance,
         chi_square=chi_square,
-        mean=mean,
-        variance=variance,
     )
-
-
-def _transfer_curve(
-    frames: Float64, *, black: float, white: float
-) -> tuple[Float64, Float64]:
-    """Mean above black and variance (pair,) of pairs of frames (pair, 2, h, w); NaN of a
-    pair that is clipped.
-    """
-    clipped = (frames >= white).mean(axis=(1, 2, 3)) > SATURATION_FRACTION
-    difference = frames[:, 0] - frames[:, 1]
-    mean = frames.mean(axis=(1, 2, 3)) - black
-    variance = difference.var(axis=(1, 2), ddof=1) / 2
-    return np.where(clipped, np.nan, mean), np.where(clipped, np.nan, variance)
 
 
 def _read_noise(
@@ -587,21 +450,8 @@ def average_dark(frames: ArrayLike) -> DarkFrame:
     ----------
     frames
         (frame, height, width, 3) values of the file, at least two frames. The lens is covered.
-
-    Raises
-    ------
-    InputError
-        Fewer than two frames, another shape, or values that are not finite.
     """
     values = np.asarray(frames).astype(float)
-    shaped = values.ndim == 4 and values.shape[-1] == 3 and len(values) >= 2
-    require(
-        shaped and np.isfinite(values).all(),
-        "dark frames",
-        "at least two frames (frame, height, width, 3) of finite values are needed",
-        f"an array of {values.shape}",
-        "repeat the frame with the lens covered",
-    )
     mean = values.mean(axis=0)
     spread = values.std(axis=0, ddof=1)
     defect = _outliers(mean) | _outliers(spread)

@@ -28,8 +28,7 @@ def test_fit_colour_matrix__inverts_a_camera():
     expected = expected * (camera[18, 1] / (expected @ camera[18])[1])
     # noise of 0.2 % times the condition of the colours
     np.testing.assert_allclose(fit.matrix, expected, atol=0.03)
-    assert fit.delta_e_after.max() < 1.0
-    assert np.median(fit.delta_e_before) > 5.0
+    assert fit.delta_e.max() < 1.0
     assert abs((fit.matrix @ camera[18])[1] / camera[18, 1] - 1) < 0.005
 
 
@@ -37,8 +36,8 @@ def test_fit_colour_matrix__leaves_out_saturated_patches():
     camera = chart_reference() @ MIX.T
     camera[[3, 7]] = np.nan
     fit = fit_colour_matrix(camera)
-    assert np.isnan(fit.delta_e_after[[3, 7]]).all()
-    assert np.nanmax(fit.delta_e_after) < 1e-4  # exact except for rounding of CIEDE2000
+    assert np.isnan(fit.delta_e[[3, 7]]).all()
+    assert np.nanmax(fit.delta_e) < 1e-4  # exact except for rounding of CIEDE2000
 
 
 @pytest.mark.parametrize(
@@ -47,7 +46,6 @@ def test_fit_colour_matrix__leaves_out_saturated_patches():
         (np.ones((24, 3)), "different colours"),
         (np.full((24, 3), np.nan), "0 usable"),
         (np.zeros((24, 3)), "different colours"),
-        (np.ones((10, 3)), "the shape"),
     ],
 )
 def test_fit_colour_matrix__refuses_what_tells_nothing(patches, match):

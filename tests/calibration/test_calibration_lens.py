@@ -28,7 +28,6 @@ def test_fit_edge__finds_the_blur(blur, side):
     fit = fit_edge(edge_picture(blur, np.random.default_rng(5))[:, ::side])
     # the square pixel adds a variance of 1/12 px2; 1 % as it is no Gaussian
     assert abs(fit.blur / np.sqrt(blur**2 + 1 / 12) - 1) < 0.01 + 4 * fit.blur_error
-    assert fit.mtf50 == pytest.approx(0.1874 / fit.blur, rel=1e-3)
 
 
 def test_veiling_glare__is_that_of_an_even_veil():
@@ -43,8 +42,6 @@ def test_veiling_glare__is_that_of_an_even_veil():
     assert veiling_glare(
         fit_edge(image), mean=float(image.mean()), contrast=0.05
     ) == pytest.approx(glare, abs=0.001)
-    with pytest.raises(InputError, match="the mean must be positive"):
-        veiling_glare(fit_edge(image), mean=0.0)
 
 
 @pytest.mark.parametrize(
@@ -104,7 +101,6 @@ def test_fit_vignette__withstands_dust_a_gradient_and_lost_pixels():
     [
         np.zeros((50, 60)),
         np.full((50, 60), np.nan),
-        np.ones((50, 60, 3)),
         np.pad(np.ones((9, 12)), 20),
     ],
 )

@@ -12,7 +12,6 @@ from scipy import stats
 from sphere import WHITE
 
 from skindb.calibration.fibres import fibre_pixels
-from skindb.errors import InputError
 from skindb.format.folder import read_capture
 from skindb.ingest.probe_profiles import (
     Profiles,
