@@ -1,5 +1,5 @@
-"""Calibration of the cameras of a dome: response, noise, vignette, colour, lens and
-dark level, with their errors; the colour matrix follows from a photographed colour chart.
+"""Calibration of the cameras of a dome: response, noise, vignette, colour and dark
+level, with their errors; the colour matrix follows from a photographed colour chart.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from skindb.calibration._merge_kernels import OK
-from skindb.calibration.lens import fit_edge, fit_vignette, veiling_glare
+from skindb.calibration.lens import fit_vignette
 from skindb.calibration.radiance import (
     merge_exposures,
     relative_exposure,
@@ -361,20 +361,6 @@ def _chart(
     }
 
 
-def _edge(
-    frames: CalibrationFrames, kind: CameraFrames, camera: CameraRecord
-) -> tuple[CameraRecord, Values]:
-    picture = _merged(frames, kind.frames, camera)[..., GREEN].astype(float)
-    (left, top), (right, bottom) = np.sort(kind.places[camera.id], axis=0).astype(int)
-    edge = fit_edge(picture[top:bottom, left:right])
-    mean = float(np.nanmean(picture))
-    return camera, {
-        "edge_blur": edge.blur,
-        "edge_blur_error": edge.blur_error,
-        "veiling_glare": veiling_glare(edge, mean=mean, contrast=kind.contrast),
-    }
-
-
 def _reprojection(points: KnownPoints, camera: CameraRecord) -> Values:
     error = reprojection_error(points.position, points.pixel, camera)
     rms = float(np.sqrt(np.mean(error**2)))
@@ -406,7 +392,6 @@ STEPS: dict[str, Step] = {
     "response": _response,
     "flat": _flat,
     "chart": _chart,
-    "edge": _edge,
 }
 
 

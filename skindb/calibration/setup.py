@@ -45,10 +45,8 @@ KINDS = {
     "response": {CAMERA, EXPOSURE},
     "flat": {CAMERA, EXPOSURE, REPEAT},
     "chart": {CAMERA, EXPOSURE},
-    "edge": {CAMERA, EXPOSURE},
 }
-# key and shape of the place of a target in a picture: patches of a ColorChecker, corners
-TARGETS = {"chart": ("patches", (24, 2)), "edge": ("region", (2, 2))}
+PATCHES = 24  # of a ColorChecker
 MIN_FLAT_FRAMES = 3  # of the flat field, for a meaningful estimate of the scatter
 
 
@@ -121,18 +119,16 @@ def of_devices(
 
 @dataclass(frozen=True)
 class CameraFrames:
-    """Templates of the frames of one kind, and where its target lies in each camera.
+    """Templates of the frames of one kind.
 
-    `places` are, by camera, the centres (24, 2) of the patches of a chart or the
-    corners (2, 2) of the region of an edge: column and row in px; empty arrays of other
-    kinds.
+    `places` are, by camera, the centres (24, 2) of the patches of a chart, column and row
+    in px; empty arrays of other kinds.
     """
 
     frames: str
     repeats: int
     white: str  # chart only
     radius: float  # chart only
-    contrast: float  # edge only
     places: Mapping[str, Float64]
 
 
@@ -223,7 +219,7 @@ def read_calibration_frames(dome: DomeRecord) -> CalibrationFrames | None:
     )
     ball = _ball_frames(dome, fields.object("ball")) if fields.has("ball") else None
     fields.require_known(
-        "its keys are exposures, dark, response, flat, chart, edge, points and ball",
+        "its keys are exposures, dark, response, flat, chart, points and ball",
         "correct the name, or remove the key",
     )
     if fields.faults:
@@ -238,19 +234,14 @@ def _camera_frames(dome: DomeRecord, item: Fields, key: str) -> CameraFrames:
     if REPEAT in needed:
         repeats = item.integer("repeats", minimum=2, maximum=MAX_REPEATS)
     places = {camera.id: np.empty((0, 2)) for camera in dome.cameras}
-    if key in TARGETS:
-        places = _places(dome, item, *TARGETS[key])
     is_chart = key == "chart"
+    if is_chart:
+        places = _places(dome, item)
     return CameraFrames(
         frames=_template(dome, item, "frames", needed),
         repeats=repeats,
         white=_template(dome, item, "white", needed) if is_chart else "",
         radius=item.number("radius", above=0.0) if is_chart else 0.0,
-        contrast=(
-            item.number("contrast", minimum=0.0, maximum=0.9, default=0.0)
-            if key == "edge"
-            else 0.0
-        ),
         places=places,
     )
 
@@ -264,13 +255,11 @@ def _template(dome: DomeRecord, item: Fields, key: str, needed: set[str]) -> str
     return template
 
 
-def _places(
-    dome: DomeRecord, item: Fields, key: str, shape: tuple[int, int]
-) -> dict[str, Float64]:
-    """Position of the target in the picture of every camera that sees it."""
-    by_camera = item.object(key, {})
+def _places(dome: DomeRecord, item: Fields) -> dict[str, Float64]:
+    """Patches of the chart in the picture of every camera that sees it."""
+    by_camera = item.object("patches", {})
     cameras = _named_cameras(dome, by_camera)
-    places = {name: by_camera.array(name, shape) for name in cameras}
+    places = {name: by_camera.array(name, (PATCHES, 2)) for name in cameras}
     for name, place in places.items():
         size = (cameras[name].width, cameras[name].height)
         if (place < 0).any() or (place > size).any():

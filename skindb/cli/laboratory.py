@@ -215,7 +215,6 @@ def _camera_lines(calibrated: dict[str, Any]) -> list[str]:
         "noise": "chi-squared at most {noise_chi_square:.2f} (1 if the sensor follows the model)",
         "vignette": "at most {vignette_residual:.2%} of the flat frames left",
         "colour": "CIEDE2000 of the chart at most {chart_difference:.2f} (median of its patches)",
-        "edge": "blur at most {edge_blur:.2f} px",
         "known points": "rms distance from their projections at most {reprojection_rms:.2f} px",
     }
     return [

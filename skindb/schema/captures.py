@@ -408,18 +408,6 @@ CHART_DIFFERENCE = declare(
     "float64 camera_calibration/chart_difference(camera) [1]",
     "median CIEDE2000 between the patches and their reference",
 )
-EDGE_BLUR = declare(
-    "float64 camera_calibration/edge_blur(camera) [pixel]",
-    "standard deviation of the blur, aperture of a pixel included",
-)
-EDGE_BLUR_ERROR = declare(
-    "float64 camera_calibration/edge_blur_error(camera) [pixel]",
-    "its standard error",
-)
-VEILING_GLARE = declare(
-    "float64 camera_calibration/veiling_glare(camera) [1]",
-    "fraction of the light that the lens spreads evenly",
-)
 REPROJECTION_RMS = declare(
     "float64 camera_calibration/reprojection_rms(camera) [pixel]",
     "rms distance of known points from their projections",

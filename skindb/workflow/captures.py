@@ -469,7 +469,6 @@ def _describe_cameras(calibration: xr.Dataset) -> dict[str, Any]:
         "noise": variables.NOISE_CHI_SQUARE,
         "vignette": variables.VIGNETTE_RESIDUAL,
         "colour": variables.CHART_DIFFERENCE,
-        "edge": variables.EDGE_BLUR,
         "known points": variables.REPROJECTION_RMS,
     }
     description = dict[str, Any]()

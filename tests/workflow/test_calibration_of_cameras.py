@@ -10,7 +10,6 @@ import imagecodecs
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from scipy.special import ndtr
 from sphere import BLACK, HEIGHT, WHITE, WIDTH, write_capture
 
 import skindb
@@ -26,7 +25,6 @@ READ = 6.0
 DARK_SEED = 3
 VIGNETTE = np.array([-0.2, 0.03, 0.0])
 TO_SRGB = np.array([[1.6, -0.45, -0.15], [-0.25, 1.4, -0.15], [0.0, -0.5, 1.5]])
-BLUR = 0.9
 GLARE = 0.0
 CENTRE = np.array([WIDTH / 2, HEIGHT / 2])
 COLUMN, ROW = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
@@ -88,14 +86,10 @@ def write_frames(setup, gamma, rng):
         np.exp(rng.uniform(np.log(0.05), np.log(150), (HEIGHT // 4, WIDTH // 4))),
         np.ones((4, 4)),
     )
-    way = (COLUMN - CENTRE[0] - np.tan(np.radians(5)) * (ROW - CENTRE[1])) * np.cos(
-        np.radians(5)
-    )
     scenes = {
         "response": blocks,
         "white": 6.0 * light * LENS,
         "chart": 6.0 * chart_radiance() * (light * LENS)[..., None],
-        "edge": 2.0 * ndtr(way / BLUR) * LENS,
     }
     for camera in ("c0", "c1"):
         for r in range(1, 9):
@@ -133,10 +127,6 @@ def write_frames(setup, gamma, rng):
             "white": "calibration/white_{camera}_{exposure}.png",
             "radius": 4,
             "patches": dict.fromkeys(both, PATCHES),
-        },
-        "edge": {
-            "frames": "calibration/edge_{camera}_{exposure}.png",
-            "region": {name: [[12, 8], [60, 56]] for name in both},
         },
     }
     if gamma == 1:
@@ -191,9 +181,6 @@ def test_calibrate_cameras__finds_what_was_put_in(pristine, tmp_path, gamma):
         found["calibrated_colour_matrix"], np.stack([TO_SRGB] * 2), atol=0.02
     )
     assert found["chart_difference"].max() < 1
-    # the shutter of a pixel is not simulated
-    assert np.abs(found["edge_blur"] - BLUR).max() < 0.05
-    assert np.abs(found["veiling_glare"]).max() < 0.01
     assert found["defect_pixels"].values.tolist() == [1, 1]
     assert np.abs(found["dark_level"] - BLACK).max() < (1 if gamma == 1 else 10)
     known = (
@@ -274,30 +261,25 @@ def test_ingest__uses_the_calibrated_cameras(linear_setup, pristine, tmp_path):
         ({"chrat": {}}, "chrat (did you mean chart?)"),
         (
             {
-                "edge": {
-                    "frames": "calibration/edge_{camera}_{exposure}.png",
-                    "region": {"c9": [[1, 1], [9, 9]]},
+                "chart": {
+                    "frames": "calibration/chart_{camera}_{exposure}.png",
+                    "white": "calibration/white_{camera}_{exposure}.png",
+                    "radius": 4,
+                    "patches": {"c9": PATCHES},
                 }
             },
             "c9",
         ),
         (
             {
-                "edge": {
-                    "frames": "calibration/edge_{camera}_{exposure}.png",
-                    "region": {"c0": [[1, 1], [99, 9]]},
+                "chart": {
+                    "frames": "calibration/chart_{camera}_{exposure}.png",
+                    "white": "calibration/white_{camera}_{exposure}.png",
+                    "radius": 4,
+                    "patches": {"c0": [[99, 9]] * 24},
                 }
             },
             "inside",
-        ),
-        (
-            {
-                "edge": {
-                    "frames": "calibration/edge_{camera}_{exposure}.png",
-                    "region": {"c0": [[1, 1], [9, 9]]},
-                }
-            },
-            "16 px",
         ),
         ({"chart": 5}, "must be a JSON object"),
         ({"exposures": [{"id": "e0", "seconds": -1}]}, "seconds"),
