@@ -572,14 +572,6 @@ class SessionParameters(Limited):
         above_minimum=True,
     )
     slower: bool = option(False, "Flash at most three times in a second.")
-    base: int = option(
-        0,
-        "Intensity of a steady lamp, in units of one light; it is measured before the "
-        "lights flash.",
-        name="base-light",
-        minimum=0,
-        maximum=1000,
-    )
     confirm_screening: bool = option(
         False,
         "Confirm that the subject was screened, consented, and keeps the eyes closed.",

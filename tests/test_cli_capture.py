@@ -110,11 +110,10 @@ def test_capture__rehearsal_is_a_capture(rehearsal):
     assert "HELLO" in (rehearsal.with_suffix(".log") / "probe.log").read_text()
 
 
-def test_capture__three_faults_only_cost_time(rehearsal, tmp_path):
+def test_capture__lost_frames_only_cost_time(rehearsal, tmp_path):
     faults = [
         "dropped_frame=c02:11",
         "dome.lost_triggers=7",
-        "hot_pixels=2",
         "probe.lost_triggers=4",
     ]
     out, result = _again(
@@ -122,9 +121,8 @@ def test_capture__three_faults_only_cost_time(rehearsal, tmp_path):
     )
     assert result.exit_code == 0, result.output + str(result.exception)
     assert "repeated" in result.output
-    assert "camera c00: 2 hot pixels in its dark frame" in result.output
     for light in (2, 9, 20):
-        name = f"dome/frames/e0/l{light:03d}_c02.png"  # camera c00 has the hot pixels
+        name = f"dome/frames/e0/l{light:03d}_c02.png"
         assert (out / name).read_bytes() == (rehearsal / name).read_bytes()
     assert read_capture(out).dome.sequence is not None
 
@@ -244,7 +242,7 @@ def test_capture__plan_only_prints(rehearsal, tmp_path):
             "must be dropped_frame=CAMERA:NUMBER",
         ),
         (
-            ["--virtual", "--fault", "hot_pixels=many"],
+            ["--virtual", "--fault", "dropped_frame=many"],
             "must be dropped_frame=CAMERA:NUMBER",
         ),
     ],
@@ -284,9 +282,6 @@ def test_capture__mistakes_of_a_real_session(rehearsal, tmp_path):
     assert "--trait: must be NAME=VALUE" in said("--consent", "fit", "--trait", "age")
     assert "--confirm-screening: an operator must be responsible for it" in said(
         "--consent", "fit", "--confirm-screening"
-    )
-    assert "--base-light: an operator must be responsible for it" in said(
-        "--consent", "fit", "--base-light", "10"
     )
     for operator in ("", "  ", "a b"):
         assert "--operator: must be 1 to 64 letters" in said(
@@ -333,7 +328,7 @@ def test_capture__mistakes_of_a_real_session(rehearsal, tmp_path):
         "--landmarks",
         "absent.json",
     ]
-    together = said(*wrong, "--seed", "3", "--fault", "hot_pixels=2")
+    together = said(*wrong, "--seed", "3", "--fault", "dome.delay=2")
     for name in (
         "consent",
         "trait",
@@ -367,7 +362,7 @@ def test_capture__mistakes_of_a_real_session(rehearsal, tmp_path):
 def test_capture__an_unfinished_capture_is_continued_for_the_same_subject_only(
     rehearsal, tmp_path
 ):
-    """Subjects must not be mixed, so another name, consent, condition, lamp or set-up
+    """Subjects must not be mixed, so another name, consent, condition or set-up
     needs another folder.
     """
     out, result = _again(rehearsal, tmp_path, "--fault", "dome.open_interlock_at=20")
@@ -376,7 +371,6 @@ def test_capture__an_unfinished_capture_is_continued_for_the_same_subject_only(
     for name, options in {
         "subject": ["--subject", "S2"],
         "condition": ["--condition", "lotion"],
-        "steady lamp": ["--base-light", "10", "--operator", "OP-1"],
     }.items():
         _, result = _again(rehearsal, tmp_path, *options)
         assert f"an unfinished capture must be resumed with the same {name}" in str(
@@ -425,106 +419,6 @@ def test_capture__a_slow_capture_is_repeated_slowly(rehearsal, tmp_path):
     assert _flashes(out) == 3
 
 
-@pytest.fixture(scope="module")
-def dome_with_lamp(rehearsal):
-    """The virtual subject with the short exposure alone, as a lamp fills the long one."""
-    setup = rehearsal.parent / "lamp"
-    shutil.copytree(rehearsal.parent / "C.virtual/subject-2005", setup)
-    record = json.loads((setup / "dome/dome.json").read_text())
-    record["exposures"] = [
-        exposure for exposure in record["exposures"] if exposure["id"] == "e1"
-    ]
-    record["sequence"] = None
-    (setup / "dome/dome.json").write_text(json.dumps(record))
-    return setup
-
-
-def _beside_lamp(dome_with_lamp, tmp_path, *options):
-    """A rehearsal beside a lamp that is stated to be as bright as ten lights."""
-    out = tmp_path / "C"
-    lamp = [
-        "--setup",
-        str(dome_with_lamp),
-        "--sites",
-        "cheek",
-        "--base-light",
-        "10",
-        "--operator",
-        "OP-1",
-    ]
-    return out, CliRunner().invoke(
-        cli, ["capture", str(out), "--virtual", *lamp, *options]
-    )
-
-
-def test_capture__a_steady_lamp_is_measured_and_makes_flashes_safe(
-    dome_with_lamp, tmp_path
-):
-    out, result = _beside_lamp(dome_with_lamp, tmp_path)
-    assert result.exit_code == 0, str(result.exception)
-    assert "at most 0 flashes in any second" in result.output
-    lamp = json.loads((out / "dome/dome.json").read_text())["steady_lamp"]
-    assert (lamp["brightness"], lamp["operator"]) == (10, "OP-1")
-    assert lamp["measured"] == pytest.approx(10, abs=0.3)
-    assert lamp["measured_after"] == pytest.approx(10, abs=0.3)
-    assert _flashes(out) == 0
-
-
-@pytest.mark.parametrize(
-    ("fraction", "said"),
-    [
-        (
-            0,
-            (
-                "steady lamp: must be as bright as 10 lights; found dark frames of "
-                "0.0% of white, so no lamp is on"
-            ),
-        ),
-        (
-            0.3,
-            (
-                "steady lamp: must be as bright as 10 lights, and at least 50% of "
-                "that; found 3.0 lights"
-            ),
-        ),
-        (
-            9,
-            (
-                "steady lamp: must leave room for a light in every exposure, at most "
-                "90% of white; found a dark"
-            ),
-        ),
-    ],
-)
-def test_capture__a_steady_lamp_that_is_not_as_stated_is_refused(
-    dome_with_lamp, tmp_path, fraction, said
-):
-    _, result = _beside_lamp(dome_with_lamp, tmp_path, "--fault", f"lamp={fraction}")
-    assert said in str(result.exception)
-
-
-def test_capture__an_exposure_that_the_lamp_fills_is_refused(rehearsal, tmp_path):
-    """The exposures of a dome without a lamp are too long beside one."""
-    _, result = _again(rehearsal, tmp_path, "--base-light", "10", "--operator", "OP-1")
-    assert "found a dark frame of 100% in exposure e0; shorten that exposure" in str(
-        result.exception
-    )
-
-
-def test_capture__flashes_are_counted_beside_the_measured_lamp(
-    dome_with_lamp, tmp_path
-):
-    """A lamp as bright as seven lights is not bright enough, although ten were stated."""
-    out, result = _beside_lamp(dome_with_lamp, tmp_path, "--fault", "lamp=0.7")
-    assert result.exit_code == 0, str(result.exception)
-    assert (
-        "a real session would be refused: sequence: an operator must confirm screening"
-        in result.output
-    )
-    assert "luminance steps of 12%" in result.output
-    assert _flashes(out) > 3
-
-
 def test_capture__a_full_disk_is_found_before_a_light_is_switched_on(
     rehearsal, tmp_path, monkeypatch
 ):
@@ -546,7 +440,6 @@ def test_capture__a_full_disk_is_found_before_a_light_is_switched_on(
     [
         "dropped_frame=c99:1",
         "dropped_frame=c02:-1",
-        "hot_pixels=-3",
         "dome.garbage=1.5",
         "dome.garbage=nan",
         "dome.delay=inf",
@@ -554,7 +447,6 @@ def test_capture__a_full_disk_is_found_before_a_light_is_switched_on(
         "dome.dead_light=l999",
         "probe.leak=-1",
         "probe.gauge=odd",
-        "lamp=-1",
     ],
 )
 def test_capture__a_fault_that_cannot_happen_is_refused(rehearsal, tmp_path, fault):

@@ -254,7 +254,7 @@ def _cross_validated(samples: ResponseSamples, value: Float64) -> float:
 def _knot_weights(value: Float64) -> Float64:
     """Weights (sample, exposure, knot) of linear interpolation between the knots."""
     position = _place(value)[..., None] * (KNOTS - 1)
-    return np.maximum(1 - np.abs(position - np.arange(KNOTS)), 0)
+    return np.asarray(np.maximum(1 - np.abs(position - np.arange(KNOTS)), 0))
 
 
 @dataclass(frozen=True)

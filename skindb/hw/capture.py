@@ -6,16 +6,13 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from skindb.errors import Fault, InputError, input_error
-from skindb.hw.brightness import Levels, failed_lights, lamp_brightness, measure_lamp
+from skindb.hw.brightness import failed_lights
 from skindb.hw.cameras import Cameras
 from skindb.hw.capture_folder import (
     Setup,
     Subject,
     Unfinished,
-    count_hot_pixels,
     identity,
     keep_failed_placement,
     keep_frames,
@@ -33,7 +30,6 @@ from skindb.hw.sequence import (
     Override,
     Rehearsal,
     Schedule,
-    assess,
     measured_flashes,
     plan_schedule,
     rehearsal_notes,
@@ -73,8 +69,6 @@ class CapturePlan:
     seconds: float | None = None
     # whether the sequence is slowed down until nobody needs to be screened
     slow: bool = False
-    base: int = 0  # brightness of a steady lamp in units of one light
-    operator: str = ""  # id of the operator responsible for that lamp
     sites: tuple[str, ...] = ()  # sites that the probe measures
     placements: int = 1  # number of placements of the probe at each site
     pressure: float = PRESSURE_KPA  # kPa, of the gauge
@@ -88,11 +82,11 @@ def planned_schedule(setup: Setup, plan: CapturePlan) -> Schedule:
     InputError
         If the sequence cannot be completed in the wanted time.
     """
-    schedule = plan_schedule(setup.lights, setup.exposures, seconds=plan.seconds)
-    schedule = Schedule(schedule.steps, plan.base)
+    exposures = setup.dome.exposures
+    schedule = plan_schedule(setup.lights, exposures, seconds=plan.seconds)
     if plan.slow:
         schedule = slowed_schedule(schedule)
-        shortest = slowed_schedule(plan_schedule(setup.lights, setup.exposures)).seconds
+        shortest = slowed_schedule(plan_schedule(setup.lights, exposures)).seconds
         if plan.seconds is not None and plan.seconds < shortest:
             raise input_error(
                 "sequence",
@@ -150,7 +144,7 @@ def run_capture(
         other conditions.
     """
     _require_devices(setup, devices, plan)
-    session = open_unfinished(out, identity(setup, subject, plan.base))
+    session = open_unfinished(out, identity(setup, subject))
     schedule = planned_schedule(setup, plan)
     notes_of_recovery = _keep_interrupted(session, setup, devices)
     remaining = (
@@ -160,23 +154,14 @@ def run_capture(
     notes = notes_of_recovery
     if any(step.light != DARK for step in remaining.steps):
         require_space(out, setup, len(remaining.steps))
-        lamp = None
-        # the flashes are counted with the measured lamp, not with the stated one
-        if plan.base:
-            lamp = measure_lamp(devices.dome, devices.cameras, setup, plan.base)
-            remaining = replace(remaining, base=min(plan.base, round(lamp)))
         if isinstance(override, Rehearsal):
             notes += rehearsal_notes(remaining, override)
         run = _run_lights(session, devices, remaining, override, progress)
-        if lamp is not None:
-            _check_lamp(session, remaining, plan, lamp, run, setup)
         _keep_run(session, run, setup)
         require_complete(run, setup.cameras)
         notes += run.notes
     notes += _measure_sites(session, setup, devices, plan, place, progress or silent)
     write_capture(session, setup, subject, files=files)
-    if not plan.base:  # beside a steady lamp every pixel of a dark frame is bright
-        notes += _hot_pixel_notes(out, setup)
     for site in session.sites:
         if site["lost_readings"]:
             notes.append(
@@ -226,9 +211,7 @@ def _run_lights(
 
 def _keep_run(session: Unfinished, run: DomeRun, setup: Setup) -> None:
     """Keep the complete steps of a run whose lights did not fail."""
-    levels = Levels(run.frames, setup.dome)
-    lamp = session.identity["steady lamp"] > 0
-    failed = failed_lights(run.schedule, levels, setup.dome, lamp=lamp)
+    failed = failed_lights(run.schedule, run.frames, setup.dome)
     run.faulty_lights = failed | run.faulty_lights
     forget_faulty_steps(run)
     session.running = None
@@ -255,35 +238,6 @@ def _keep_interrupted(session: Unfinished, setup: Setup, devices: Devices) -> li
     return [
         f"{len(session.sequence) - before} steps were kept from the sequence that was interrupted"
     ]
-
-
-def _check_lamp(
-    session: Unfinished,
-    remaining: Schedule,
-    plan: CapturePlan,
-    before: float,
-    run: DomeRun,
-    setup: Setup,
-) -> None:
-    """Record the brightness of the steady lamp; if it became darker, count the flashes again."""
-    after = lamp_brightness(run.schedule, Levels(run.frames, setup.dome), setup.dome)
-    is_visible = bool(np.isfinite(after))
-    session.lamp = {
-        "brightness": plan.base,
-        "operator": plan.operator,
-        "measured": round(before, 2),
-        "measured_after": round(after, 2) if is_visible else None,
-    }
-    beside = replace(remaining, base=round(after) if is_visible else 0)
-    flashes = assess(beside).flashes_per_second
-    if flashes > assess(remaining).flashes_per_second:
-        state = "not visible"
-        if is_visible:
-            state = f"{after:.1f} times as bright as a light"
-        seen = f"the subject may have seen {flashes} flashes in a second"
-        run.notes.append(f"the steady lamp was {state} after the lights, so {seen}")
-        session.count(flashes, None)
-    session.save()
 
 
 def _require_devices(setup: Setup, devices: Devices, plan: CapturePlan) -> None:
@@ -379,19 +333,6 @@ def _measure_site(
     )
 
 
-def _hot_pixel_notes(out: Path, setup: Setup) -> list[str]:
-    notes = []
-    for camera in setup.dome["cameras"]:
-        bits = int(camera.get("bit_depth", 16))
-        white = float(camera.get("white_level", 2**bits - 1))
-        dark = sorted((out / "dome/dark").glob(f"*_{camera['id']}.*"))
-        if count := max(
-            (count_hot_pixels(path, white, bits) for path in dark), default=0
-        ):
-            notes.append(f"camera {camera['id']}: {count} hot pixels in its dark frame")
-    return notes
-
-
 def _report(
     session: Unfinished, schedule: Schedule, run: DomeRun | None, notes: list[str]
 ) -> dict[str, Any]:
@@ -407,7 +348,6 @@ def _report(
         "frames_of_this_session": 0 if run is None else len(run.frames),
         "seconds": schedule.seconds,
         "flashes_per_second": session.flashes_per_second,
-        "luminance_step": assess(schedule).luminance_step,
         "sites": {site: {"pressure_drift_kpa": value} for site, value in drift.items()},
         "notes": notes,
     }

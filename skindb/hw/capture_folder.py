@@ -15,20 +15,23 @@ from typing import Any
 
 import numpy as np
 
-from skindb.errors import Fault, InputError, input_error, system_fault
+from skindb.calibration.setup import PROBE_FILE, read_setup_dome
+from skindb.errors import Fault, InputError, input_error, require, system_fault
 from skindb.files import make_private, private_file
-from skindb.format.fields import read_json
+from skindb.format.dome import CameraRecord, DomeRecord
+from skindb.format.fields import Fields, read_json
 from skindb.format.frames import (
     Frame,
     FrameKind,
-    frame_size,
     is_linear,
+    read_exposures,
     read_frame,
     write_frame,
 )
 from skindb.hw.probe import Reading
 from skindb.hw.sequence import DARK, Schedule, Step, partial_schedule, sequence_entry
 from skindb.hw.session import DomeRun, SiteRun
+from skindb.limits import MAX_FIBRES
 
 UNFINISHED = "unfinished.json"  # removed when the capture is complete
 STEP_KEYS = {"light", "exposure", "t_on", "t_off", "trigger_count"}
@@ -52,8 +55,6 @@ class Unfinished:
     # the confirmation for the session with the most flashes per second
     override: dict[str, Any] | None = None
     flashes_per_second: int = 0  # of the session with the most
-    # the steady lamp: stated and measured brightness, and responsible operator
-    lamp: dict[str, Any] | None = None
     running: dict[str, Any] | None = None  # steps that are running, see `begin_run`
 
     @property
@@ -90,7 +91,7 @@ class Unfinished:
         steps = [
             [step.light, step.exposure, step.on_us, step.off_us] for step in part.steps
         ]
-        self.running = {"steps": steps, "base": part.base, "started": now}
+        self.running = {"steps": steps, "started": now}
         self.save()
 
     def interrupted_run(self) -> tuple[Schedule, float] | None:
@@ -99,10 +100,8 @@ class Unfinished:
         """
         if self.running is None:
             return None
-        schedule = Schedule(
-            tuple(Step(*step) for step in self.running["steps"]), self.running["base"]
-        )
-        return schedule, self.running["started"]
+        schedule = Schedule(tuple(Step(*step) for step in self.running["steps"]))
+        return schedule, float(self.running["started"])
 
 
 def open_unfinished(folder: Path, identity: Mapping[str, Any]) -> Unfinished:
@@ -152,59 +151,22 @@ def open_unfinished(folder: Path, identity: Mapping[str, Any]) -> Unfinished:
 
 
 def _read(folder: Path, path: Path, note: Any) -> Unfinished:
-    record = note if isinstance(note, dict) else {}
-    identity = record.get("identity")
-    override = record.get("override")
-    sequence = _entries(record.get("sequence"), STEP_KEYS)
-    sites = _entries(record.get("sites"), SITE_KEYS)
-    flashes, lamp, running = (
-        record.get(name) for name in ("flashes_per_second", "lamp", "running")
+    try:
+        begun = Unfinished(folder, **note)
+        begun.interrupted_run()
+        sound = isinstance(begun.identity, dict)
+        sound &= all(step.keys() >= STEP_KEYS for step in begun.sequence)
+        sound &= all(site.keys() >= SITE_KEYS for site in begun.sites)
+    except (TypeError, ValueError, KeyError, AttributeError):
+        sound = False
+    require(
+        sound,
+        str(path),
+        "must be the record of an unfinished capture",
+        "other content",
+        "choose another folder; the existing frames are kept",
     )
-    sound = all(
-        isinstance(part, dict | None) for part in (override, lamp)
-    ) and isinstance(flashes, int)
-    sound = sound and (running is None or _is_run(running))
-    if not isinstance(identity, dict) or sequence is None or sites is None or not sound:
-        raise input_error(
-            str(path),
-            "must be the record of an unfinished capture",
-            "other content",
-            "choose another folder; the existing frames are kept",
-        )
-    return Unfinished(
-        folder,
-        identity,
-        sequence,
-        sites,
-        override,
-        int(record["flashes_per_second"]),
-        lamp,
-        running,
-    )
-
-
-def _is_run(value: Any) -> bool:
-    """Whether a value is a record of `Unfinished.begin_run`."""
-    if not isinstance(value, dict) or not isinstance(value.get("base"), int):
-        return False
-    steps = value.get("steps")
-    kinds = (str, str, int, int)
-    if not isinstance(steps, list) or not isinstance(value.get("started"), int | float):
-        return False
-    return all(
-        isinstance(step, list)
-        and len(step) == len(kinds)
-        and all(map(isinstance, step, kinds))
-        for step in steps
-    )
-
-
-def _entries(value: Any, keys: set[str]) -> list[dict[str, Any]] | None:
-    """The value if it is a list of objects with these keys, else None."""
-    sound = isinstance(value, list) and all(
-        isinstance(entry, dict) and keys <= entry.keys() for entry in value
-    )
-    return value if sound else None
+    return begun
 
 
 def _require_same(
@@ -285,88 +247,52 @@ class Setup:
     """
 
     folder: Path
-    dome: Mapping[str, Any]
-    probe: Mapping[str, Any] | None
+    dome: DomeRecord
+    record: Mapping[str, Any]  # content of dome.json
+    probe: Mapping[str, Any] | None  # content of probe.json
+    brackets: Mapping[str, float]  # id of an exposure of the probe -> seconds
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """Ids of the cameras."""
-        return tuple(str(camera["id"]) for camera in self.dome["cameras"])
+        return tuple(camera.id for camera in self.dome.cameras)
 
     @property
     def lights(self) -> tuple[str, ...]:
         """Ids of the lights."""
-        return tuple(str(light["id"]) for light in self.dome["lights"])
-
-    @property
-    def exposures(self) -> dict[str, float]:
-        """Id of an exposure of the dome -> seconds."""
-        return _seconds_by_id(self.dome)
-
-    @property
-    def brackets(self) -> dict[str, float]:
-        """Id of an exposure of the probe -> seconds."""
-        return {} if self.probe is None else _seconds_by_id(self.probe)
-
-
-def _seconds_by_id(device: Mapping[str, Any]) -> dict[str, float]:
-    """Id of an exposure of a device -> seconds."""
-    exposures = device["exposures"]
-    return {str(record["id"]): float(record["seconds"]) for record in exposures}
+        return tuple(light.id for light in self.dome.lights)
 
 
 def read_setup(folder: Path) -> Setup:
-    """Read the folder of a set-up.
+    """Read the folder of a set-up; a session takes its own dark frames.
 
     Raises
     ------
     InputError
-        If a file is missing or is not a JSON object with lights, cameras and exposures.
+        With every fault of a file that ingest could not read.
     """
+    dome = read_setup_dome(folder, white=False, dark=False)
     faults = list[Fault]()
-    dome = read_json(folder / "dome/dome.json", faults)
-    has_probe = (folder / "contact/probe.json").is_file()
-    probe = read_json(folder / "contact/probe.json", faults) if has_probe else None
-    for name, record, keys in (
-        ("dome/dome.json", dome, ("cameras", "lights", "exposures")),
-        ("contact/probe.json", probe, ("exposures", "fibres")),
-    ):
-        for key in keys if record is not None else ():
-            items = record.get(key) if isinstance(record, dict) else None
-            if (
-                not isinstance(items, list)
-                or not items
-                or not all(isinstance(i, dict) and "id" in i for i in items)
-            ):
-                rule = "must be a list of objects with an id"
-                faults.append(
-                    Fault(
-                        f"{folder / name}[{key}]",
-                        rule,
-                        "something else",
-                        "see docs/howto/capture.md",
-                    )
-                )
-    if not faults and not isinstance(dome, dict):
-        rule = "must contain dome/dome.json"
-        faults.append(
-            Fault(str(folder), rule, "no such file", "see docs/howto/capture.md")
-        )
+    record = read_json(dome.file, faults)
+    file = folder / PROBE_FILE
+    probe = None
+    brackets = dict[str, float]()
+    if file.is_file() and (probe := read_json(file, faults)) is not None:
+        fields = Fields(probe, str(file), faults)
+        brackets = read_exposures(fields)
+        fields.items("fibres", maximum=MAX_FIBRES)
     if faults:
         raise InputError(faults)
-    return Setup(folder, dome, probe if isinstance(probe, dict) else None)
+    return Setup(folder, dome, record, probe, brackets)
 
 
-def identity(setup: Setup, subject: Subject, base: int) -> dict[str, Any]:
-    """Record that must be the same in all sessions of a capture; `base` is the
-    brightness of the steady lamp.
-    """
+def identity(setup: Setup, subject: Subject) -> dict[str, Any]:
+    """Record that must be the same in all sessions of a capture."""
     record = {
         "subject": subject.subject,
         "condition": subject.condition,
         "consent": dict(subject.consent),
-        "set-up": digest(setup.dome, setup.probe),
-        "steady lamp": base,
+        "set-up": digest(setup.record, setup.probe),
     }
     if subject.virtual:
         record["virtual subject"] = subject.virtual
@@ -377,9 +303,7 @@ def require_space(folder: Path, setup: Setup, steps: int) -> None:
     """Raise `InputError` with the needed and free space if the uncompressed frames do
     not fit on the disk.
     """
-    pixels = sum(
-        int(camera["width"]) * int(camera["height"]) for camera in setup.dome["cameras"]
-    )
+    pixels = sum(camera.width * camera.height for camera in setup.dome.cameras)
     needed = steps * pixels * 3 * 2  # bytes of three channels of 16 bits
     free = shutil.disk_usage(folder).free
     if free < needed:
@@ -424,11 +348,7 @@ def keep_frames(session: Unfinished, run: DomeRun, setup: Setup) -> None:
             _copy(run.frames[camera, i], session.folder / f"{name}{suffix}")
         entry = sequence_entry(step, measured)
         added.append(entry | {key: entry[key] + offset for key in ("t_on", "t_off")})
-    bits = {
-        str(camera_record["id"]): int(camera_record.get("bit_depth", 16))
-        for camera_record in setup.dome["cameras"]
-    }
-    _keep_dark_frames(session.folder, run, cameras, suffix, bits)
+    _keep_dark_frames(session.folder, run, setup.dome.cameras, suffix)
     session.sequence = sorted(
         [*entries, *added], key=lambda entry: float(entry["t_on"])
     )
@@ -485,9 +405,8 @@ def keep_failed_placement(
 def _keep_dark_frames(
     out: Path,
     run: DomeRun,
-    cameras: Sequence[str],
+    cameras: Sequence[CameraRecord],
     suffix: str,
-    bits: Mapping[str, int],
 ) -> None:
     """Write the mean of the dark frames of every exposure and camera.
 
@@ -499,26 +418,25 @@ def _keep_dark_frames(
         for i, step in enumerate(run.schedule.steps):
             if (
                 step.light == DARK
-                and (camera, i) in run.frames
+                and (path := run.frames.get((camera.id, i)))
                 and (i < last_step or not by_exposure)
             ):
-                by_exposure.setdefault(step.exposure, []).append(run.frames[camera, i])
+                by_exposure.setdefault(step.exposure, []).append(path)
         for exposure, paths in by_exposure.items():
-            target = out / f"dome/dark/{exposure}_{camera}{suffix}"
+            target = out / f"dome/dark/{exposure}_{camera.id}{suffix}"
             if not target.exists():
-                _write_mean(paths, target, bits[camera])
+                _write_mean(paths, target, camera.sensor.kind)
 
 
-def _write_mean(paths: Sequence[Path], target: Path, bits: int) -> None:
+def _write_mean(paths: Sequence[Path], target: Path, kind: FrameKind) -> None:
     """Write the mean of those frames that can be decoded."""
-    size = frame_size(paths[0])
-    if len(paths) == 1 or size is None or is_linear(paths[0]):
+    if len(paths) == 1 or is_linear(paths[0]):
         _copy(paths[0], target)
         return
     frames = list[Frame]()
     for path in paths:
         with suppress(InputError):
-            frames.append(read_frame(path, FrameKind(*size, bits)))
+            frames.append(read_frame(path, kind))
     if frames:
         target.parent.mkdir(parents=True, exist_ok=True)
         write_frame(target, np.rint(np.mean(frames, axis=0)).astype(frames[0].dtype))
@@ -555,14 +473,14 @@ def write_capture(
         record[key] = name
     dome = {
         key: value
-        for key, value in setup.dome.items()
+        for key, value in setup.record.items()
         if key not in ("frames", "dark", "sequence")
     }
     suffix = next((out / "dome/frames").glob("*/*")).suffix
     dark = f"dome/dark/{{exposure}}_{{camera}}{suffix}"
     has_dark = all(
         (out / dark.format(exposure=e, camera=c)).is_file()
-        for e in setup.exposures
+        for e in setup.dome.exposures
         for c in setup.cameras
     )
     dome |= {
@@ -570,8 +488,6 @@ def write_capture(
         "sequence": session.sequence,
         "dark": dark if has_dark else None,
     }
-    if session.lamp:
-        dome["steady_lamp"] = session.lamp
     _copy_white(setup, out)
     _dump(out / "dome/dome.json", dome)
     if session.sites and setup.probe is not None:
@@ -627,13 +543,8 @@ def _write_probe(session: Unfinished, probe: Mapping[str, Any]) -> None:
 
 def _copy_white(setup: Setup, out: Path) -> None:
     """Copy the frames of the white target from the set-up, so that every capture has its own."""
-    white = setup.dome.get("white")
-    if isinstance(white, dict) and isinstance(white.get("frames"), str):
-        top = Path(white["frames"].split("{")[0]).parts[:2]
-        if top and ".." not in top:
-            shutil.copytree(
-                setup.folder.joinpath(*top), out.joinpath(*top), dirs_exist_ok=True
-            )
+    for file in setup.dome.frame_files("white"):
+        _copy(file, out / file.relative_to(setup.folder))
 
 
 def _copy(path: Path, target: Path) -> None:
@@ -644,12 +555,3 @@ def _copy(path: Path, target: Path) -> None:
 def _dump(path: Path, record: Mapping[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(record, indent=1), encoding="utf-8")
-
-
-def count_hot_pixels(path: Path, white: float, bits: int) -> int:
-    """Number of pixels of a dark frame that reach half the white level in any channel."""
-    size = frame_size(path)
-    if size is None:
-        return 0
-    frame = read_frame(path, FrameKind(*size, bits))
-    return int((frame >= white / 2).any(axis=-1).sum())

@@ -91,7 +91,7 @@ class Dome:
         """
         seconds = (len(schedule.steps) + 2) * REPLY_SECONDS
         deadline = self.link.clock.monotonic() + seconds
-        self.link.request("CLEAR", base=schedule.base)
+        self.link.request("CLEAR")
         for index, step in enumerate(schedule.steps):
             if self.link.clock.monotonic() > deadline:
                 raise self.link.error(

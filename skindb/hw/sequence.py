@@ -23,8 +23,6 @@ GAP_SECONDS = 0.002
 # for 150 lights and two exposures (Weyrich et al. 2005, section 5)
 PAPER_SECONDS = 25.0
 MAX_FLASHES = 3  # in any second
-# smallest relative change of luminance that counts as one half of a flash
-MIN_LUMINANCE_STEP = 0.1
 WINDOW_US = 1_000_000
 MAX_JITTER_US = 1_000  # of a measured time
 
@@ -43,12 +41,9 @@ class Step:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Steps in order; `base` is the brightness of a steady lamp beside them, in units
-    of one light.
-    """
+    """Steps in order."""
 
     steps: tuple[Step, ...]
-    base: int = 0
 
     @property
     def seconds(self) -> float:
@@ -80,7 +75,7 @@ class Schedule:
                 else step.off_us
             )
             start += max(after - step.on_us, length + round(GAP_SECONDS * 1e6))
-        return replace(self, steps=tuple(chosen))
+        return Schedule(tuple(chosen))
 
 
 @dataclass(frozen=True)
@@ -170,11 +165,9 @@ def sequence_entry(step: Step, measured: Measured) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Assessment:
-    """Flashes and luminance steps of a sequence."""
+    """Flashes of a sequence."""
 
     flashes_per_second: int  # largest number in any second
-    # when a light is switched on, relative to the luminance with that light
-    luminance_step: float
     seconds: float  # duration of the sequence
 
     @property
@@ -188,7 +181,7 @@ class Assessment:
             f"at most {self.flashes_per_second} "
             f"{'flash' if self.flashes_per_second == 1 else 'flashes'} in any second"
         )
-        return f"{rate}, luminance steps of {self.luminance_step:.0%}, {self.seconds:.1f} s"
+        return f"{rate}, {self.seconds:.1f} s"
 
 
 @dataclass(frozen=True)
@@ -227,22 +220,15 @@ class Rehearsal:
 
 
 def assess(schedule: Schedule, *, window_us: int = WINDOW_US) -> Assessment:
-    """Flashes and luminance steps of a schedule, in any second or window of another length."""
-    step = (
-        1 / (1 + schedule.base)
-        if any(entry.light != DARK for entry in schedule.steps)
-        else 0.0
-    )
+    """Flashes of a schedule, in any second or window of another length."""
     starts = sorted(entry.on_us for entry in schedule.steps if entry.light != DARK)
-    if step < MIN_LUMINANCE_STEP:
-        starts = []
     flashes = 0
     begin = 0
     for end, start in enumerate(starts):
         while starts[begin] <= start - window_us:
             begin += 1
         flashes = max(flashes, end - begin + 1)
-    return Assessment(flashes, step, schedule.seconds)
+    return Assessment(flashes, schedule.seconds)
 
 
 def measured_flashes(schedule: Schedule, measured: Sequence[Measured | None]) -> int:
@@ -251,7 +237,7 @@ def measured_flashes(schedule: Schedule, measured: Sequence[Measured | None]) ->
     for step, times in zip(schedule.steps, measured, strict=True):
         if times is not None:
             steps.append(replace(step, on_us=times.on_us, off_us=times.off_us))
-    lit = replace(schedule, steps=tuple(steps))
+    lit = Schedule(tuple(steps))
     return assess(lit, window_us=WINDOW_US - 2 * MAX_JITTER_US).flashes_per_second
 
 
@@ -268,7 +254,7 @@ def slowed_schedule(schedule: Schedule, flashes: int = MAX_FLASHES) -> Schedule:
             replace(step, on_us=start, off_us=start + step.off_us - step.on_us)
         )
         start += max(period if step.light != DARK else 0, following - step.on_us)
-    return replace(schedule, steps=tuple(steps))
+    return Schedule(tuple(steps))
 
 
 def partial_schedule(schedule: Schedule, steps: Iterable[int]) -> Schedule:
@@ -284,25 +270,11 @@ def partial_schedule(schedule: Schedule, steps: Iterable[int]) -> Schedule:
     )
 
 
-def with_base_light(schedule: Schedule) -> Schedule:
-    """The schedule with a steady lamp so bright that switching on one more light is not a flash."""
-    return replace(schedule, base=int(1 / MIN_LUMINANCE_STEP))
-
-
-def alternatives(schedule: Schedule) -> list[str]:
-    """Descriptions of alternative schedules that need no override, one line each, with
-    their cost.
-    """
+def slower_alternative(schedule: Schedule) -> str:
+    """Description of the alternative that needs no override, in one line, with its cost."""
     late = slowed_schedule(schedule)
-    lit = with_base_light(schedule)
-    noise = (1 + lit.base) ** 0.5
-    return [
-        f"slower (--slower): {assess(late)}, {late.seconds - schedule.seconds:.1f} s longer",
-        f"a steady lamp as bright as {lit.base} lights (--base-light {lit.base}): "
-        f"{assess(lit)}; photon "
-        f"noise {noise:.1f} times as high, and dark frames must be taken with the lamp on; its "
-        "brightness is measured before the lights flash",
-    ]
+    longer = late.seconds - schedule.seconds
+    return f"slower (--slower): {assess(late)}, {longer:.1f} s longer"
 
 
 def require_safe(
@@ -346,6 +318,5 @@ def _flash_fault(schedule: Schedule, assessment: Assessment) -> Fault:
         "an operator must confirm screening, consent and closed eyes for more than "
         f"{MAX_FLASHES} flashes in a second",
         str(assessment),
-        f"give --confirm-screening --operator ID, or --slower ({longer:.1f} s longer), "
-        "or a steady lamp (see --plan)",
+        f"give --confirm-screening --operator ID, or --slower ({longer:.1f} s longer)",
     )

@@ -88,7 +88,7 @@ def with_dark_frames(schedule: Schedule, *, count: int = DARK_FRAMES) -> Schedul
     start = steps[-1].off_us + PAUSE_US
     shortest = min(lengths, key=lengths.__getitem__)
     steps.append(Step(DARK, shortest, start, start + lengths[shortest]))
-    return Schedule(tuple(steps), schedule.base)
+    return Schedule(tuple(steps))
 
 
 def capture_dome(

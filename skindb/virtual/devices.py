@@ -30,8 +30,6 @@ WATCHDOG_SECONDS = 0.5  # without a message, after which the lights go off
 PRESSURE_PERIOD = 0.1  # s between readings of the gauge
 PUMP_SECONDS = 0.3  # time constant of the suction
 MAX_FLASHES = 3  # in any period of one second
-# one more light is not a flash beside a steady lamp as bright as this many lights
-BASE_FOR_NO_FLASH = 10
 GAUGE_FAULTS = ("nan", "silent", "late", "wild")
 LATE_SECONDS = 1.0
 WILD_KPA = 500.0
@@ -200,7 +198,6 @@ class EmulatedDome(Emulated):
         self.reason = ""
         self.steps = list[_Step]()
         self.on: str | None = None  # light that is on
-        self.base = 0
         self._start = 0.0
         self._runs = 0
         self._done = 0
@@ -292,12 +289,11 @@ class EmulatedDome(Emulated):
         self.on = self._stuck or None
         self._done = self._done + 1
 
-    def _clear(self, values: dict[str, str]) -> dict[str, object]:
+    def _clear(self, _: dict[str, str]) -> dict[str, object]:
         self.steps = []
         self.state = "idle"
         self.reason = ""
         self._done = 0
-        self.base = int(values.get("base", "0"))
         return {}
 
     def _add(self, values: dict[str, str]) -> dict[str, object]:
@@ -329,11 +325,7 @@ class EmulatedDome(Emulated):
             raise RefusedError("another plan is held")
         if not self.interlock_closed:
             raise RefusedError("the interlock is open")
-        starts = (
-            [s.on_us for s in self.steps if s.light != "-"]
-            if self.base < BASE_FOR_NO_FLASH
-            else []
-        )
+        starts = [s.on_us for s in self.steps if s.light != "-"]
         often = any(
             b - a < 1_000_000
             for a, b in zip(starts, starts[MAX_FLASHES:], strict=False)

@@ -17,7 +17,7 @@ import numpy as np
 
 from skindb.clock import Clock, SimulatedClock
 from skindb.errors import input_error
-from skindb.types import Float64, Index, float64, lengths
+from skindb.types import Float64, float64
 from skindb.virtual.devices import (
     GAUGE_FAULTS,
     DeviceFaults,
@@ -26,7 +26,6 @@ from skindb.virtual.devices import (
     EmulatedProbe,
 )
 
-LAMP_LIGHTS = 8  # among which the brightest one in a camera is looked for
 # arbitrary wall time, as cameras do not know when the controller started
 FIRST_FRAME_TIME = 1_700_000_000.0
 PROBABILITIES = ("garbage", "lost_replies")  # of `DeviceFaults`
@@ -42,8 +41,6 @@ class LaboratoryFaults:
     # camera and number of the trigger, counted from 0
     dropped_frames: tuple[tuple[str, int], ...] = ()
     dropped_probe_frames: tuple[int, ...] = ()
-    hot_pixels: int = 0  # number in the first camera, at the white level in every frame
-    lamp: float = 1.0  # brightness of the steady lamp relative to the stated one
 
 
 class Laboratory:
@@ -61,8 +58,6 @@ class Laboratory:
         Simulated faults.
     clock
         Clock of the devices; by default a simulated one.
-    lamp
-        Brightness of a steady lamp, in every camera in units of the brightest light.
     """
 
     def __init__(
@@ -72,7 +67,6 @@ class Laboratory:
         faults: LaboratoryFaults | None = None,
         *,
         clock: Clock | None = None,
-        lamp: float = 0.0,
     ) -> None:
         self.subject = subject
         self.watched = watched
@@ -84,10 +78,6 @@ class Laboratory:
         self.cameras = tuple(str(camera["id"]) for camera in self._record["cameras"])
         self.site = ""  # current site of the probe
         self._triggers = dict.fromkeys((*self.cameras, "probe"), 0)
-        self._hot = self._hot_pixels()
-        self._lamp = lamp * self.faults.lamp
-        lit = self.cameras if self._lamp else ()
-        self._brightest = {camera: self._brightest_light(camera) for camera in lit}
         lights = tuple(str(light["id"]) for light in self._record["lights"])
         self.dome = EmulatedDome(
             lights, self._photograph, self.faults.dome, clock=self.clock
@@ -121,9 +111,6 @@ class Laboratory:
                 continue
             target = self.watched / camera / f"IMG_{number:05d}.png"
             lit = {name: factor for name, factor in factors.items() if name != "-"}
-            if self._lamp:
-                name = self._brightest[camera]
-                lit[name] = lit.get(name, 0.0) + self._lamp
             self._write(target, camera, exposure, lit, FIRST_FRAME_TIME + seconds)
 
     def _write(
@@ -146,9 +133,7 @@ class Laboratory:
         self, target: Path, camera: str, exposure: str, factors: dict[str, float]
     ) -> None:
         dark = self._source("dark", camera, exposure)
-        if [*factors.values()] == [1.0] and not (
-            len(self._hot) and camera == self.cameras[0]
-        ):
+        if [*factors.values()] == [1.0]:
             shutil.copyfile(
                 self._required(camera, exposure, next(iter(factors))), target
             )
@@ -166,31 +151,10 @@ class Laboratory:
         base = value.copy()
         for light, factor in factors.items():
             value += factor * (_read(self._required(camera, exposure, light)) - base)
-        if camera == self.cameras[0]:
-            value[self._hot[:, 0], self._hot[:, 1]] = white
         png = imagecodecs.png_encode(
             np.clip(np.rint(value), 0, white).astype(np.uint16)
         )
         target.write_bytes(png)
-
-    def _brightest_light(self, camera: str) -> str:
-        """The light that looks brightest in a camera; it is one of those nearest to it."""
-        record = next(
-            entry for entry in self._record["cameras"] if entry["id"] == camera
-        )
-        exposure = min(
-            self._record["exposures"], key=lambda entry: float(entry["seconds"])
-        )["id"]
-        centre = -np.array(record["R"]).T @ np.array(record["t"])
-        places = np.array(
-            [light["position"] for light in self._record["lights"]], np.float64
-        )
-        nearest = np.argsort(-places @ centre / lengths(places))[:LAMP_LIGHTS]
-        names = [str(self._record["lights"][i]["id"]) for i in nearest]
-        frames = {name: _read(self._required(camera, exposure, name)) for name in names}
-        return max(
-            names, key=lambda name: float(np.quantile(frames[name].mean(axis=-1), 0.9))
-        )
 
     def _source(
         self, key: str, camera: str, exposure: str, light: str = ""
@@ -233,12 +197,6 @@ class Laboratory:
         self._triggers[camera] += 1
         return self._triggers[camera] - 1
 
-    def _hot_pixels(self) -> Index:
-        camera = self._record["cameras"][0]
-        rng = np.random.default_rng(self.faults.dome.seed)
-        high = [camera["height"], camera["width"]]
-        return rng.integers(0, high, (self.faults.hot_pixels, 2))
-
 
 def _read(path: Path) -> Float64:
     return float64(imagecodecs.png_decode(path.read_bytes()))
@@ -247,8 +205,8 @@ def _read(path: Path) -> Float64:
 def laboratory_faults(
     texts: Sequence[str], lights: Collection[str], cameras: Collection[str]
 ) -> LaboratoryFaults | None:
-    """Faults from texts NAME=VALUE: those of `DeviceFaults` for dome or probe, dropped
-    frames, hot pixels and a dark lamp; None if there are no texts.
+    """Faults from texts NAME=VALUE: those of `DeviceFaults` for dome or probe, and
+    dropped frames; None if there are no texts.
 
     Parameters
     ----------
@@ -279,18 +237,13 @@ def laboratory_faults(
                     raise ValueError(camera)
                 dropped = settings.get("dropped_frames", ())
                 settings["dropped_frames"] = (*dropped, (camera, _count(number)))
-            elif fault == "hot_pixels":
-                settings["hot_pixels"] = _count(value)
-            elif fault == "lamp":
-                settings["lamp"] = _fault_value(fault, "float", value, lights)
             else:
                 raise ValueError(name)
         except ValueError:
             names = ", ".join(f"dome.{n}" for n in kinds)
             raise input_error(
                 "--fault",
-                "must be dropped_frame=CAMERA:NUMBER, hot_pixels=N, lamp=FRACTION, "
-                f"{names}, or the same with probe",
+                f"must be dropped_frame=CAMERA:NUMBER, {names}, or the same with probe",
                 repr(text),
                 "numbers are not negative, probabilities at most 1, lights and cameras "
                 "those of the set-up",

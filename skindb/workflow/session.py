@@ -10,7 +10,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from skindb.calibration.setup import read_setup_dome
 from skindb.clock import SYSTEM_CLOCK, Clock, SimulatedClock
 from skindb.errors import Fault, InputError, input_error
 from skindb.files import make_private, private_umask
@@ -29,7 +28,7 @@ from skindb.hw.capture_folder import (
 from skindb.hw.dome import Dome
 from skindb.hw.link import Link, open_port
 from skindb.hw.probe import Probe
-from skindb.hw.sequence import Override, Rehearsal, alternatives, assess
+from skindb.hw.sequence import Override, Rehearsal, assess, slower_alternative
 from skindb.parameters import VIRTUAL_SEED, SessionParameters
 from skindb.schema.consent import SCOPES
 from skindb.types import Progress
@@ -63,7 +62,7 @@ def plan_session(
     schedule = planned_schedule(setup, plan)
     assessment = assess(schedule)
     lines = [
-        f"{len(setup.lights)} lights, {len(setup.exposures)} exposures, "
+        f"{len(setup.lights)} lights, {len(setup.dome.exposures)} exposures, "
         f"{len(setup.cameras)} cameras: {assessment}"
     ]
     if brackets := setup.brackets:
@@ -74,21 +73,15 @@ def plan_session(
             f"probe: {len(brackets)} exposures of together {sum(brackets.values()):.0f} s, "
             f"placements: {plan.placements} at {sites}"
         )
-    if plan.base:
-        lines.append(
-            "the lamp is measured before the lights flash; beside a darker one, "
-            "they count as flashes"
-        )
     if not assessment.safe:
         lines += [
             "above 3 flashes in a second: needs --confirm-screening --operator ID, or",
-            *alternatives(schedule),
+            slower_alternative(schedule),
         ]
     return {
         "seconds": assessment.seconds,
         "flashes_per_second": assessment.flashes_per_second,
         "safe": assessment.safe,
-        "luminance_step": assessment.luminance_step,
         "steps": len(schedule.steps),
     }, lines
 
@@ -124,9 +117,6 @@ def capture_session(
         stack.enter_context(one_session(out))
         laboratory = stack.enter_context(_laboratory(out, parameters, progress))
         setup = _setup(parameters, laboratory)
-        # what ingest cannot read is refused before the subject is there; the session
-        # takes its own dark frames
-        read_setup_dome(setup.folder, white=False, dark=False)
         plan = _plan(setup, parameters)
         files = _files(parameters, laboratory)
         read_scan(files["mesh"])
@@ -261,14 +251,12 @@ def _subject_faults(parameters: SessionParameters) -> list[Fault]:
 def _operator_faults(parameters: SessionParameters) -> list[Fault]:
     operator = parameters.operator
     confirmed = parameters.confirm_screening
-    real_lamp = parameters.base and not parameters.virtual
     if operator is not None and not re.fullmatch(IDENTIFIER.pattern, operator):
         return [Fault("--operator", IDENTIFIER.text, repr(operator), "correct it")]
-    if operator is None and (confirmed or real_lamp):
-        option = "--confirm-screening" if confirmed else "--base-light"
+    if operator is None and confirmed:
         return [
             Fault(
-                option,
+                "--confirm-screening",
                 "an operator must be responsible for it",
                 "no --operator",
                 "add --operator ID",
@@ -308,8 +296,6 @@ def _plan(setup: Setup, parameters: SessionParameters) -> CapturePlan:
     return CapturePlan(
         parameters.seconds,
         parameters.slower,
-        parameters.base,
-        operator=parameters.operator or "",
         sites=sites,
         placements=parameters.placements,
     )
@@ -440,12 +426,13 @@ def _laboratory(
             f"{frames} in {subject}",
             "name another capture; skindb simulate writes some",
         )
-    setup = read_setup(subject)
-    faults = laboratory_faults(parameters.faults, setup.lights, setup.cameras)
+    lights = [light.id for light in dome.lights]
+    cameras = [camera.id for camera in dome.cameras]
+    faults = laboratory_faults(parameters.faults, lights, cameras)
     watched = beside / "frames"
     clock = SimulatedClock(time.time())
     try:
-        yield Laboratory(subject, watched, faults, clock=clock, lamp=parameters.base)
+        yield Laboratory(subject, watched, faults, clock=clock)
     finally:
         shutil.rmtree(watched, ignore_errors=True)  # the capture has its own copies
 

@@ -54,6 +54,7 @@ def subject_folder(folder: Path) -> Path:
                 1000 * (1 + number) + (site == "neck"),
             )
     sensor = {"width": 6, "height": 4, "black_level": BLACK, "bit_depth": 16}
+    sensor["K"] = [[100, 0, 3], [0, 100, 2], [0, 0, 1]]
     pose = {"R": np.diag([1, -1, -1]).tolist(), "t": [0, 0, 500]}
     cameras = [{"id": name} | sensor | pose for name in CAMERAS]
     dome = {
@@ -88,12 +89,9 @@ class Bench:
         faults: LaboratoryFaults | None = None,
         *,
         log: Path | None = None,
-        lamp: float = 0.0,
     ):
         self.clock = SimulatedClock()
-        self.laboratory = Laboratory(
-            subject, watched, faults, clock=self.clock, lamp=lamp
-        )
+        self.laboratory = Laboratory(subject, watched, faults, clock=self.clock)
         self.watched = watched
         self.dome = Dome(
             Link(self.laboratory.port("dome"), "dome", clock=self.clock, log=log)

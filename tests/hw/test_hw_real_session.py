@@ -89,13 +89,3 @@ def test_capture__a_real_session_without_a_confirmation_is_refused(setup, tmp_pa
         in str(result.exception)
     )
     assert laboratory.dome._runs == 0
-
-
-def test_capture__a_real_session_without_its_lamp_is_refused(setup, tmp_path):
-    laboratory, result = _capture(
-        setup, tmp_path / "C", "--base-light", "10", "--operator", "OP-1"
-    )
-    assert "steady lamp: must be as bright as 10 lights; found dark frames of" in str(
-        result.exception
-    )
-    assert {step.light for step in laboratory.dome.steps} == {"-"}

@@ -19,14 +19,13 @@ from skindb.hw.sequence import (
     Override,
     Schedule,
     Step,
-    alternatives,
     assess,
     partial_schedule,
     plan_schedule,
     require_safe,
     sequence_entry,
     slowed_schedule,
-    with_base_light,
+    slower_alternative,
 )
 from skindb.hw.session import with_dark_frames
 
@@ -98,12 +97,10 @@ def _check_assess__is_the_count_in_any_second(seed):
     )
 
 
-def test_alternatives__need_no_override():
+def test_slower_alternative__needs_no_override():
     assert assess(slowed_schedule(PAPER)).flashes_per_second <= MAX_FLASHES
-    assert assess(with_base_light(PAPER)).safe
     assert require_safe(slowed_schedule(PAPER), None).safe
-    texts = alternatives(PAPER)
-    assert "74.7 s longer" in texts[0]
+    assert "74.7 s longer" in slower_alternative(PAPER)
     assert assess(slowed_schedule(with_dark_frames(PAPER))).safe
     assert assess(Schedule(())).safe
     assert assess(Schedule((Step(DARK, "e", 0, 10),))).flashes_per_second == 0
