@@ -2,11 +2,12 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-from skindb.errors import Fault, InputError, input_error
+from skindb.errors import Fault, InputError, few_names, input_error
 from skindb.hw.brightness import failed_lights
 from skindb.hw.cameras import Cameras
 from skindb.hw.capture_folder import (
@@ -14,7 +15,6 @@ from skindb.hw.capture_folder import (
     Subject,
     Unfinished,
     identity,
-    keep_failed_placement,
     keep_frames,
     keep_site,
     open_unfinished,
@@ -23,7 +23,7 @@ from skindb.hw.capture_folder import (
     write_capture,
 )
 from skindb.hw.dome import Dome
-from skindb.hw.probe import PRESSURE_KPA, PlacementError, Probe, Reading
+from skindb.hw.probe import PRESSURE_KPA, PlacementError, Probe
 from skindb.hw.sequence import (
     DARK,
     MAX_FLASHES,
@@ -38,7 +38,6 @@ from skindb.hw.sequence import (
 )
 from skindb.hw.session import (
     DomeRun,
-    SiteRun,
     capture_dome,
     capture_site,
     forget_faulty_steps,
@@ -146,12 +145,11 @@ def run_capture(
     _require_devices(setup, devices, plan)
     session = open_unfinished(out, identity(setup, subject))
     schedule = planned_schedule(setup, plan)
-    notes_of_recovery = _keep_interrupted(session, setup, devices)
+    notes = _keep_interrupted(session, setup, devices)
     remaining = (
         remaining_schedule(schedule, session.sequence) if session.sequence else schedule
     )
     run = None
-    notes = notes_of_recovery
     if any(step.light != DARK for step in remaining.steps):
         require_space(out, setup, len(remaining.steps))
         if isinstance(override, Rehearsal):
@@ -185,17 +183,15 @@ def _run_lights(
     before = replace(session)
     session.count(assessment.flashes_per_second, confirmed)
     clock = devices.dome.link.clock
-
-    def begin(part: Schedule) -> None:
-        session.begin_run(part, clock.now())
-
-    options: dict[str, Any] = {
-        "override": override,
-        "begin": begin,
-        "progress": progress,
-    }
     try:
-        run = capture_dome(devices.dome, devices.cameras, remaining, **options)
+        run = capture_dome(
+            devices.dome,
+            devices.cameras,
+            remaining,
+            override=override,
+            begin=lambda part: session.begin_run(part, clock.now()),
+            progress=progress,
+        )
     except InputError:  # nothing was lit
         before.save()
         raise
@@ -229,10 +225,8 @@ def _keep_interrupted(session: Unfinished, setup: Setup, devices: Devices) -> li
         session.running = None
         session.save()
         return [
-            (
-                "the controller has forgotten the sequence that was interrupted; all "
-                "of its steps were repeated"
-            )
+            "the controller has forgotten the sequence that was interrupted; all "
+            "of its steps were repeated"
         ]
     _keep_run(session, run, setup)
     return [
@@ -242,23 +236,15 @@ def _keep_interrupted(session: Unfinished, setup: Setup, devices: Devices) -> li
 
 def _require_devices(setup: Setup, devices: Devices, plan: CapturePlan) -> None:
     faults = []
-    if unknown := sorted(set(setup.lights) - set(devices.dome.lights)):
-        rule = "the controller must have every light of dome.json"
-        cure = "correct the ids, or the wiring"
-        faults.append(
-            Fault(
-                devices.dome.link.name, rule, f"no light {', '.join(unknown[:5])}", cure
-            )
-        )
-    if unknown := sorted(set(setup.cameras) - set(devices.cameras.ids)):
-        rule = "every camera of dome.json must be connected"
-        cure = "set up their folders"
-        faults.append(
-            Fault("cameras", rule, f"no camera {', '.join(unknown[:5])}", cure)
-        )
-    if plan.sites and (
-        devices.probe is None or devices.probe_camera is None or setup.probe is None
+    dome = devices.dome
+    for where, kind, needed, present, cure in (
+        (dome.link.name, "light", setup.lights, dome.lights, "correct the ids"),
+        ("cameras", "camera", setup.cameras, devices.cameras.ids, "set up its folder"),
     ):
+        if missing := sorted(set(needed) - set(present)):
+            rule = f"must have every {kind} of dome.json"
+            faults.append(Fault(where, rule, f"no {kind} {few_names(missing)}", cure))
+    if plan.sites and None in (devices.probe, devices.probe_camera, setup.probe):
         rule = "a probe, its camera and contact/probe.json must be present to measure sites"
         faults.append(
             Fault("probe", rule, "one of them missing", "connect it, or name no sites")
@@ -284,10 +270,19 @@ def _measure_sites(
     complete = {(entry["site"], entry["number"]) for entry in session.sites}
     for site, number in product(plan.sites, range(1, plan.placements + 1)):
         for attempt in range(ATTEMPTS if (site, number) not in complete else 0):
-            readings = list[Reading]()
+            # `_require_devices` asserts it
+            assert devices.probe is not None
+            assert devices.probe_camera is not None
             try:
                 place(site, number)
-                run = _measure_site(setup, devices, plan, site, readings, report)
+                run = capture_site(
+                    devices.probe,
+                    devices.probe_camera,
+                    site,
+                    setup.brackets,
+                    pressure=plan.pressure,
+                    progress=partial(report, f"probe {site}"),
+                )
                 keep_site(session, run, number)
                 break
             except KeyboardInterrupt:
@@ -297,40 +292,12 @@ def _measure_sites(
                     f"stopped by the operator at {site}, placement {number}",
                     "run the same command again; it resumes with this placement",
                 ) from None
-            except InputError as error:
-                keep_failed_placement(session, site, number, error, readings)
-                if not isinstance(error, PlacementError) or attempt == ATTEMPTS - 1:
+            except PlacementError as error:
+                if attempt == ATTEMPTS - 1:
                     raise
                 reason = "; ".join(map(str, error.faults))
                 notes.append(f"{site}, placement {number}: measured again ({reason})")
     return notes
-
-
-def _measure_site(
-    setup: Setup,
-    devices: Devices,
-    plan: CapturePlan,
-    site: str,
-    readings: list[Reading],
-    report: Progress,
-) -> SiteRun:
-    # `_require_devices` asserts it
-    if devices.probe is None or devices.probe_camera is None:
-        raise input_error(
-            "probe", "must be connected to measure sites", "no probe", "connect it"
-        )
-
-    def advance(done: int, total: int) -> None:
-        report(f"probe {site}", done, total)
-
-    options: dict[str, Any] = {
-        "pressure": plan.pressure,
-        "progress": advance,
-        "readings": readings,
-    }
-    return capture_site(
-        devices.probe, devices.probe_camera, site, setup.brackets, **options
-    )
 
 
 def _report(
@@ -338,9 +305,7 @@ def _report(
 ) -> dict[str, Any]:
     drift = dict[str, float]()
     for entry in session.sites:
-        drift[entry["site"]] = max(
-            drift.get(entry["site"], entry["drift_kpa"]), entry["drift_kpa"]
-        )
+        drift[entry["site"]] = max(drift.get(entry["site"], 0.0), entry["drift_kpa"])
     return {
         "path": str(session.folder),
         "steps": len(schedule.steps),

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from skindb.calibration.setup import PROBE_FILE, read_setup_dome
-from skindb.errors import Fault, InputError, input_error, require, system_fault
+from skindb.errors import Fault, InputError, input_error, require
 from skindb.files import make_private, private_file
 from skindb.format.dome import CameraRecord, DomeRecord
 from skindb.format.fields import Fields, read_json
@@ -28,7 +28,6 @@ from skindb.format.frames import (
     read_frame,
     write_frame,
 )
-from skindb.hw.probe import Reading
 from skindb.hw.sequence import DARK, Schedule, Step, partial_schedule, sequence_entry
 from skindb.hw.session import DomeRun, SiteRun
 from skindb.limits import MAX_FIBRES
@@ -38,7 +37,6 @@ STEP_KEYS = {"light", "exposure", "t_on", "t_off", "trigger_count"}
 SITE_KEYS = {"site", "number", "pressure", "suffix", "drift_kpa", "lost_readings"}
 FRAMES = "dome/frames/{exposure}/{light}_{camera}"  # without the suffix of the files
 SITE_FRAMES = "contact/{site}/{exposure}-{placement}"
-FAILED_PLACEMENTS = "contact/failed_placements.jsonl"  # one JSON object on each line
 
 
 @dataclass
@@ -375,31 +373,6 @@ def keep_site(session: Unfinished, run: SiteRun, number: int) -> None:
     }
     session.sites.append(entry)
     session.save()
-
-
-def keep_failed_placement(
-    session: Unfinished,
-    site: str,
-    number: int,
-    error: InputError,
-    readings: Sequence[Reading],
-) -> None:
-    """Record a failed placement of the probe with its readings of the gauge."""
-    path = session.folder / FAILED_PLACEMENTS
-    entry = {
-        "site": site,
-        "number": number,
-        "reason": str(error),
-        "pressure": np.round(readings, 4).tolist(),
-    }
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(entry) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError as problem:
-        raise InputError([*error.faults, system_fault(problem, str(path))]) from None
 
 
 def _keep_dark_frames(

@@ -249,28 +249,31 @@ class Dome:
         sent = self.link.clock.monotonic()
         state = self.state(len(schedule.steps))
         now = self.link.clock.monotonic()
-        if state.state not in ("running", "done", "stopped"):
-            raise self.link.error(
+        total = len(schedule.steps)
+        for wrong, rule, found in (
+            (
+                state.state not in ("running", "done", "stopped"),
                 "must be running, done or stopped after START",
                 state.state,
-                FIRMWARE_CURE,
-            )
-        if state.state == "running" and state.interlock == "open":
-            raise self.link.error(
-                "must stop when the interlock is open", "running", FIRMWARE_CURE
-            )
-        if state.state == "done" and state.step < len(schedule.steps):
-            raise self.link.error(
-                f"must finish {len(schedule.steps)} steps before it is done",
+            ),
+            (
+                state.state == "running" and state.interlock == "open",
+                "must stop when the interlock is open",
+                "running",
+            ),
+            (
+                state.state == "done" and state.step < total,
+                f"must finish {total} steps before it is done",
                 f"{state.step} steps",
-                FIRMWARE_CURE,
-            )
-        if state.step < before.step:
-            raise self.link.error(
+            ),
+            (
+                state.step < before.step,
                 "must not count fewer finished steps than before",
                 f"{state.step} after {before.step}",
-                FIRMWARE_CURE,
-            )
+            ),
+        ):
+            if wrong:
+                raise self.link.error(rule, found, FIRMWARE_CURE)
         at_least = sent - start.replied
         at_most = now - start.requested
         self._require_due(schedule, state, at_least=at_least, at_most=at_most)
@@ -280,12 +283,7 @@ class Dome:
         self, schedule: Schedule, state: DomeState, *, at_least: float, at_most: float
     ) -> None:
         """Refuse progress that is slower or faster than the plan; times are seconds since START."""
-        last_step = schedule.steps[-1]
-        step = (
-            schedule.steps[state.step]
-            if state.step < len(schedule.steps)
-            else last_step
-        )
+        step = schedule.steps[min(state.step, len(schedule.steps) - 1)]
         latest = step.off_us / 1e6 * (1 + CLOCK_ERROR) + SLACK_SECONDS
         if state.state == "running" and at_least > latest:
             raise self.link.error(

@@ -78,12 +78,10 @@ class Gauge:
         Link to the probe.
     target
         Pressure [kPa] that the probe should hold.
-    readings
-        List to which the readings are appended.
     """
 
-    def __init__(self, link: Link, target: float, readings: list[Reading]) -> None:
-        self.readings = readings
+    def __init__(self, link: Link, target: float) -> None:
+        self.readings = list[Reading]()
         # whether the pressure was reached, so that it must be held
         self.settled = False
         self._link = link
@@ -175,7 +173,6 @@ class Probe:
         *,
         pressure: float = PRESSURE_KPA,
         progress: Callable[[int, int], None] | None = None,
-        readings: list[Reading] | None = None,
     ) -> Placement:
         """Apply suction, expose every bracket, and release; the light and the suction
         end also after an error.
@@ -190,8 +187,6 @@ class Probe:
             Pressure of the gauge [kPa], negative.
         progress
             Called with the exposures done and the exposures in all.
-        readings
-            List to which the readings of the gauge are appended, so that they survive an error.
 
         Raises
         ------
@@ -210,7 +205,7 @@ class Probe:
         self.link.discard_events()
         lost = self.link.lost_events
         with stopped_at_end(self.stop):
-            gauge = Gauge(self.link, pressure, [] if readings is None else readings)
+            gauge = Gauge(self.link, pressure)
             self.link.request("PUMP", kpa=f"{pressure:g}")
             self._settle(gauge, pressure)
             unused = len(gauge.readings) - 1

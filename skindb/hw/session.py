@@ -11,7 +11,7 @@ from skindb.errors import Fault, InputError
 from skindb.hw.cameras import Cameras, match_frames
 from skindb.hw.dome import STOPPED, Dome
 from skindb.hw.link import DeviceError, RefusedError
-from skindb.hw.probe import PRESSURE_KPA, Placement, PlacementError, Probe, Reading
+from skindb.hw.probe import PRESSURE_KPA, Placement, PlacementError, Probe
 from skindb.hw.sequence import (
     DARK,
     Measured,
@@ -405,7 +405,6 @@ def capture_site(
     *,
     pressure: float = PRESSURE_KPA,
     progress: Callable[[int, int], None] | None = None,
-    readings: list[Reading] | None = None,
 ) -> SiteRun:
     """Measure one site once.
 
@@ -415,7 +414,7 @@ def capture_site(
         The devices.
     site
         Name of the site.
-    exposures, pressure, progress, readings
+    exposures, pressure, progress
         As in `Probe.measure`.
 
     Raises
@@ -426,9 +425,7 @@ def capture_site(
         If the probe does not answer, or sends what cannot be right.
     """
     camera.start()
-    placement = probe.measure(
-        exposures, pressure=pressure, progress=progress, readings=readings
-    )
+    placement = probe.measure(exposures, pressure=pressure, progress=progress)
     [(name, shots)] = camera.collect(len(exposures), FRAME_SECONDS).items()
     triggers = sum(placement.triggers.values())
     if not len(shots) == triggers == len(exposures):

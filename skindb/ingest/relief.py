@@ -21,7 +21,16 @@ from skindb.format.dome import CameraRecord, DomeRecord, LightRecord
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.geometry.scan import Scan
 from skindb.limits import MAX_RELIEF_POINTS
-from skindb.types import Float32, Float64, Half, Index, Mask, dots, finite_rows
+from skindb.types import (
+    Float32,
+    Float64,
+    Half,
+    Index,
+    Mask,
+    dots,
+    finite_rows,
+    lengths,
+)
 
 # error of the normals for which their prior has no effect [degree]
 NO_SCAN_DEGREES = 60.0
@@ -245,18 +254,16 @@ def photometric_normals(
         NaN where fewer than three lights are used, where these are in a plane, or where
         the normal faces away from the camera.
     """
-    normal = np.full((lit[0].size, 3), np.nan)
-    enough = np.flatnonzero((lit.sum(axis=0) >= MIN_LIGHTS).ravel())
+    shown = lit.reshape(len(lights), -1)
+    measured = values.reshape(shown.shape)
+    place, view = points.reshape(-1, 3), towards.reshape(-1, 3)
+    normal = np.full(place.shape, np.nan)
+    enough = np.flatnonzero(shown.sum(axis=0) >= MIN_LIGHTS)
     for i in range(0, len(enough), POINTS_PER_BLOCK):
         at = enough[i : i + POINTS_PER_BLOCK]
-        normal[at] = _normals_of(
-            values.reshape(len(lights), -1)[:, at].astype(np.float64),
-            lit.reshape(len(lights), -1)[:, at].astype(np.float64),
-            lights,
-            points.reshape(-1, 3)[at],
-            towards.reshape(-1, 3)[at],
-        )
-    return normal.reshape(*lit.shape[1:], 3)
+        value, weight = (part[:, at].astype(np.float64) for part in (measured, shown))
+        normal[at] = _normals_of(value, weight, lights, place[at], view[at])
+    return normal.reshape(points.shape)
 
 
 def _normals_of(
@@ -294,11 +301,9 @@ def _normals_of(
     spread = np.linalg.eigvalsh(
         np.einsum("jpa,jpb->pab", weight[..., None] * direction, direction)
     )
-    length = np.linalg.norm(solution, axis=1)
-    unit = solution / np.maximum(length, 1e-300)[:, None]
-    facing = dots(unit, view)
-    good = (spread[:, 0] > MIN_SPREAD * spread[:, 2]) & (facing > 0) & (length > 0)
-    return np.where(good[:, None], unit, np.nan)
+    good = (spread[:, 0] > MIN_SPREAD * spread[:, 2]) & (dots(solution, view) > 0)
+    length = np.maximum(lengths(solution), 1e-300)
+    return np.where(good[:, None], solution / length[:, None], np.nan)
 
 
 def _wrong_axes(normal: Float64) -> str:
@@ -338,41 +343,23 @@ def _integrated(normal: Float64, known: Mask, rays: Float64) -> Float64:
     The gradient of the logarithm of the depth Z along the picture follows from
     P = C + Z r and n . dP = 0: it is -(n . dr) / (n . r).
     """
-    shape = known.shape
-    number = np.full(shape, -1)
+    number = np.full(known.shape, -1)
     number[known] = np.arange(known.sum())
-    cosine = np.einsum("hwa,hwa->hw", normal, rays)
-    length = np.linalg.norm(rays, axis=-1)
-    cosine = np.minimum(cosine, -MIN_COSINE * length)
-    first, second, slope, weight = [], [], [], []
-    for axis in (0, 1):
-        a, b = np.moveaxis(known, axis, 0)[:-1], np.moveaxis(known, axis, 0)[1:]
-        both = a & b
-        turned = np.moveaxis(rays, axis, 0)
-        change = turned[1:] - turned[:-1]
-        n = np.moveaxis(normal, axis, 0)
-        c = np.moveaxis(cosine, axis, 0)
-        along = [
-            -np.einsum("hwa,hwa->hw", part, change)[both] / facing[both]
-            for part, facing in ((n[:-1], c[:-1]), (n[1:], c[1:]))
-        ]
-        ids = np.moveaxis(number, axis, 0)
-        first.append(ids[:-1][both])
-        second.append(ids[1:][both])
-        slope.append((along[0] + along[1]) / 2)
-        lengths = np.moveaxis(length, axis, 0)
-        facing = np.minimum(-c[:-1] / lengths[:-1], -c[1:] / lengths[1:])[both]
-        weight.append(facing**2)
-    solution = _robust_heights(
-        np.concatenate(first),
-        np.concatenate(second),
-        np.concatenate(slope),
-        np.concatenate(weight),
-        int(known.sum()),
+    down, across = (number[:-1], number[1:]), (number[:, :-1], number[:, 1:])
+    pairs = np.hstack([np.reshape(side, (2, -1)) for side in (down, across)])
+    first, second = pairs[:, (pairs >= 0).all(axis=0)]
+    way, facing = rays[known], normal[known]
+    length = lengths(way)
+    cosine = np.minimum(dots(facing, way), -MIN_COSINE * length)
+    change = way[second] - way[first]
+    along = [-dots(facing[i], change) / cosine[i] for i in (first, second)]
+    steepness = cosine / length
+    weight = np.maximum(steepness[first], steepness[second]) ** 2
+    depth = np.zeros(known.shape)
+    depth[known] = _robust_heights(
+        first, second, (along[0] + along[1]) / 2, weight, len(way)
     )
-    out = np.zeros(shape)
-    out[known] = solution
-    return out
+    return depth
 
 
 def _robust_heights(
@@ -385,14 +372,9 @@ def _robust_heights(
     if not len(slope):
         return height
     edges = np.arange(len(slope))
-    ones = np.ones(len(slope))
-    difference = coo_array(
-        (
-            np.concatenate([-ones, ones]),
-            (np.concatenate([edges, edges]), np.concatenate([first, second])),
-        ),
-        shape=(len(slope), count),
-    ).tocsr()
+    signs = np.repeat([-1.0, 1.0], len(slope))
+    ends = (np.tile(edges, 2), np.concatenate([first, second]))
+    difference = coo_array((signs, ends), shape=(len(slope), count)).tocsr()
     used = weight
     for _ in range(3):
         scaled = diags_array(used) @ difference
@@ -411,20 +393,10 @@ def _faces(known: Mask, depth: Float64, width: float) -> Index:
     """Triangles (f, 3) of the points of the grid, which face the camera and do not cross
     steps of depth.
     """
-    rows, columns = known.shape
-    number = np.arange(rows * columns).reshape(rows, columns)
-    corners = np.stack(
-        [
-            part.ravel()
-            for part in (
-                number[:-1, :-1],
-                number[1:, :-1],
-                number[1:, 1:],
-                number[:-1, 1:],
-            )
-        ],
-        axis=1,
-    )
+    number = np.arange(known.size).reshape(known.shape)
+    upper, lower = number[:-1], number[1:]
+    sides = (upper[:, :-1], lower[:, :-1], lower[:, 1:], upper[:, 1:])
+    corners = np.stack(sides, axis=-1).reshape(-1, 4)
     near = depth.ravel()[corners]
     whole = known.ravel()[corners].all(axis=1)
     whole &= np.ptp(near, axis=1) < MAX_SLOPE * width

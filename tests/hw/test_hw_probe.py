@@ -87,14 +87,6 @@ def test_measure__a_wrong_pressure_ends_it_at_once(kpa, said, seconds):
     assert device.clock.monotonic() < seconds + 1.0
 
 
-def test_measure__readings_until_the_failure_are_kept():
-    readings = []
-    with pytest.raises(DeviceError, match="found 'nan'"):
-        _measure(OddProbe(_from(3.0, kpa="nan")), readings=readings)
-    assert readings[-1][0] == pytest.approx(2.9, abs=0.15)
-    assert np.isfinite(readings).all()
-
-
 @pytest.mark.parametrize(
     "seconds", [0.0, 0.4, 3.0], ids=["never", "while it settles", "while it exposes"]
 )
