@@ -15,15 +15,15 @@ import skindb
 from skindb.cli.options import (
     DB,
     PATH,
+    SCHEDULER,
     WAIT,
     WORKERS,
     Finite,
     asked,
-    common,
+    command,
     options_of,
 )
 from skindb.cli.shared import (
-    SCHEDULER,
     calibrated_by_lines,
     calibration_lines,
     choice_lines,
@@ -46,10 +46,9 @@ if TYPE_CHECKING:
     from skindb.store import Database, Record
 
 
-@click.command()
+@command
 @click.option("--out", type=PATH, default=Path("demo"), help="Folder to write.")
 @options_of(DemoParameters)
-@common
 def demo(out: Path, parameters: DemoParameters) -> None:
     """Run every step on simulated subjects, and write a report.
 
@@ -70,7 +69,7 @@ def demo(out: Path, parameters: DemoParameters) -> None:
     )
 
 
-@click.command()
+@command
 @click.argument("out", type=PATH)
 @click.option(
     "--takes",
@@ -95,13 +94,11 @@ def demo(out: Path, parameters: DemoParameters) -> None:
 )
 @options_of(SimulationParameters)
 @WORKERS
-@common
 def simulate(
     out: Path,
     takes: int,
     cohort: int | None,
     conditions: tuple[str, ...],
-    workers: int,
     parameters: SimulationParameters,
 ) -> None:
     """Write virtual captures with their true values beside them.
@@ -127,9 +124,7 @@ def simulate(
         skindb.workflow.simulate_one, out, parameters, people=people, progress=progress
     )
     numbers = range(takes if people is None else len(people))
-    results, faults = each_take(
-        call, numbers, workers=workers, progress=progress, finish=_simulated
-    )
+    results, faults = each_take(call, numbers, progress=progress, finish=_simulated)
     emit([results[name] for name in sorted(results)], [], faults)
 
 
@@ -137,7 +132,7 @@ def _simulated(simulated: tuple[int, Path]) -> tuple[str, Any, list[str]]:
     return f"{simulated[0]:04d}", str(simulated[1]), [str(simulated[1])]
 
 
-@click.command()
+@command
 @DB
 @click.argument("captures", metavar="CAPTURE...", nargs=-1, required=True, type=PATH)
 @options_of(IngestParameters)
@@ -165,7 +160,6 @@ def _simulated(simulated: tuple[int, Path]) -> tuple[str, Any, list[str]]:
 @WAIT
 @WORKERS
 @SCHEDULER
-@common
 def ingest(
     db: str,
     captures: tuple[Path, ...],
@@ -174,8 +168,6 @@ def ingest(
     again: bool,
     explain: bool,
     wait: float,
-    workers: int,
-    scheduler: str | None,
     parameters: IngestParameters,
 ) -> None:
     """Ingest capture folders into the database DB.
@@ -200,13 +192,11 @@ def ingest(
         **asdict(parameters),
     )
     finish = partial(_ingested, database, explain=explain)
-    folders = [shared_path(folder, scheduler) for folder in captures]
+    folders = [shared_path(folder) for folder in captures]
     with _logged(database, folders):
         results, faults = each_take(
             call,
             folders,
-            workers=workers,
-            scheduler=scheduler,
             shared=database.folder,
             progress=progress,
             finish=finish,

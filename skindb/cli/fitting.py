@@ -16,15 +16,15 @@ from skindb.cli.options import (
     DB,
     DICTIONARY,
     PATH,
+    SCHEDULER,
     WAIT,
     WORKERS,
     Finite,
     asked,
-    common,
+    command,
     options_of,
 )
 from skindb.cli.shared import (
-    SCHEDULER,
     aligned,
     choice_lines,
     each_take,
@@ -47,7 +47,7 @@ MAX_RESIDUAL = 0.2
 MIN_FITTED_FRACTION = 0.5
 
 
-@click.command()
+@command
 @DB
 @click.argument("takes", metavar="[TAKE...]", nargs=-1)
 @options_of(FitParameters, only_set=True)
@@ -64,7 +64,6 @@ MIN_FITTED_FRACTION = 0.5
 @WAIT
 @WORKERS
 @SCHEDULER
-@common
 def fit(
     db: str,
     takes: tuple[str, ...],
@@ -72,8 +71,6 @@ def fit(
     refit: bool,
     explain: bool,
     wait: float,
-    workers: int,
-    scheduler: str | None,
     changes: dict[str, Any],
 ) -> None:
     """Fit the named takes, or all without a current model.
@@ -85,7 +82,7 @@ def fit(
     database = existing(db)
     progress = bar()
     workflow = skindb.workflow
-    dictionary = shared_path(dictionary, scheduler)
+    dictionary = shared_path(dictionary)
     # its faults are reported once, before the fits start
     workflow.dictionary_at(dictionary)
     chosen = takes or workflow.takes_to_fit(
@@ -106,7 +103,7 @@ def fit(
     results: dict[str, Any] = {}
     faults: list[Fault] = []
     if chosen:
-        if scheduler is None and not explain:
+        if not (asked("scheduler") or explain):
             skindb.fit.compile_kernels(progress)
         with workflow.logged_action(
             database, "fit", chosen, arguments={"refit": refit, "explain": explain}
@@ -114,8 +111,6 @@ def fit(
             results, faults = each_take(
                 call,
                 chosen,
-                workers=workers,
-                scheduler=scheduler,
                 shared=database.folder,
                 progress=progress,
                 finish=finish,
@@ -258,7 +253,7 @@ def _suspect_line(suspect: dict[str, Any]) -> str:
     )
 
 
-@click.command("dictionary")
+@command
 @click.argument("path", type=PATH, required=False)
 @click.option(
     "--disc",
@@ -266,7 +261,6 @@ def _suspect_line(suspect: dict[str, Any]) -> str:
     default=0.8,
     help="Angular radius of the lights in degrees.",
 )
-@common
 def dictionary_command(path: Path | None, disc: float) -> None:
     """Report on the BRDFs in PATH or of the embedded dictionary.
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 import skindb
-from skindb.cli.options import PATH, common, options_of
+from skindb.cli.options import PATH, command, options_of
 from skindb.cli.shared import emit
 from skindb.cli.terminal import bar, echo
 from skindb.parameters import ImportParameters, QuickParameters
@@ -19,7 +19,7 @@ SOURCE = click.argument("source", type=PATH)
 OUT = click.argument("out", type=PATH)
 
 
-@click.command("import")
+@command
 @SOURCE
 @OUT
 @click.option(
@@ -43,7 +43,6 @@ OUT = click.argument("out", type=PATH)
 )
 @click.option("--condition", default="normal", help="Condition of the skin.")
 @options_of(ImportParameters)
-@common
 def import_command(
     source: Path,
     out: Path,
@@ -78,11 +77,10 @@ def import_command(
     )
 
 
-@click.command()
+@command
 @SOURCE
 @OUT
 @options_of(QuickParameters)
-@common
 def quick(source: Path, out: Path, parameters: QuickParameters) -> None:
     """Estimate normals, albedo and gloss from the pictures in the folder SOURCE.
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import skindb
-from skindb.cli.options import DB, PATH, PORT, common, options_of
+from skindb.cli.options import DB, PATH, PORT, command, options_of
 from skindb.cli.shared import emit, existing, serve, writable
 from skindb.cli.terminal import bar, wait_for_enter
 from skindb.parameters import CalibrationParameters, SessionParameters
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from skindb.store import Record
 
 
-@click.command()
+@command
 @click.argument("out", type=PATH)
 @options_of(SessionParameters)
 @click.option(
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     is_flag=True,
     help="Start each placement of the probe without waiting for Enter.",
 )
-@common
 def capture(
     out: Path, parameters: SessionParameters, only_plan: bool, yes: bool
 ) -> None:
@@ -76,7 +75,7 @@ def _ask(site: str, number: int) -> None:
         raise KeyboardInterrupt from None
 
 
-@click.command()
+@command
 @DB
 @click.argument("sources", metavar="[SETUP|TAKE...]", nargs=-1)
 @click.option(
@@ -85,7 +84,6 @@ def _ask(site: str, number: int) -> None:
     help="Errors of lights and cameras from fitted takes of a rig.  [default: all takes]",
 )
 @options_of(CalibrationParameters)
-@common
 def calibrate(
     db: str,
     sources: tuple[str, ...],
@@ -223,7 +221,7 @@ def _camera_lines(calibrated: dict[str, Any]) -> list[str]:
     ]
 
 
-@click.command()
+@command
 @click.argument("scan", type=PATH)
 @click.option(
     "--out",
@@ -232,7 +230,6 @@ def _camera_lines(calibrated: dict[str, Any]) -> list[str]:
     help="File for the landmarks (.json).",
 )
 @PORT
-@common
 def landmarks(scan: Path, out: Path, port: int) -> None:
     """Set the 20 landmarks and a crop box on a scan in a browser.
 

@@ -11,6 +11,7 @@ from types import UnionType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import click
+from click.core import ParameterSource
 
 import skindb
 from skindb.limits import MAX_SEED, MAX_WAIT_S, MAX_WORKERS
@@ -25,13 +26,6 @@ PORT = click.option(
     type=click.IntRange(0, 65535),
     default=0,
     help="Port of the local server; 0 chooses a free one.",
-)
-WORKERS = click.option(
-    "--workers",
-    type=click.IntRange(1, MAX_WORKERS),
-    default=1,
-    is_eager=True,  # parsed before --scheduler
-    help="Number of takes processed at a time, each in its own process.",
 )
 GENERATION = click.option(
     "--generation",
@@ -207,22 +201,44 @@ WAIT = click.option(
 )
 
 
-def _remember(ctx: click.Context, option: click.Parameter, value: bool) -> None:
+def _remember(ctx: click.Context, option: click.Parameter, value: Any) -> None:
     ctx.meta[str(option.name)] = value
     ctx.meta.setdefault("since", time.monotonic())
 
 
-def _remember_text(
-    ctx: click.Context, option: click.Parameter, value: str | None
-) -> None:
-    ctx.meta[str(option.name)] = value
+def _refuse_both(ctx: click.Context, option: click.Parameter, value: Any) -> None:
+    source = ctx.get_parameter_source("workers")
+    if value is not None and source is ParameterSource.COMMANDLINE:
+        raise click.UsageError(
+            "--workers starts local processes and --scheduler uses a cluster; give only one of them"
+        )
+    _remember(ctx, option, value)
 
 
+WORKERS = click.option(
+    "--workers",
+    type=click.IntRange(1, MAX_WORKERS),
+    default=1,
+    is_eager=True,  # before --scheduler is read
+    expose_value=False,
+    callback=_remember,
+    help="Number of takes processed at a time, each in its own process.",
+)
+SCHEDULER = click.option(
+    "--scheduler",
+    metavar="ADDRESS",
+    expose_value=False,
+    callback=_refuse_both,
+    help=(
+        "Dask scheduler whose workers process the takes: tcp://HOST:PORT, or the .json "
+        "file that it wrote."
+    ),
+)
 PROGRESS = click.option(
     "--progress",
     type=click.Choice(["bar", "json", "none"]),
     expose_value=False,
-    callback=_remember_text,
+    callback=_remember,
     help="Progress on standard error: bars, a JSON object per line, or none.  [default: bar]",
 )
 
@@ -244,27 +260,34 @@ ACTOR = click.option(
 )
 
 
-def common(command: Callable[..., Any]) -> Callable[..., Any]:
+def common(function: Command) -> Command:
     """Add the options that every command has; their values are kept in the context, see `asked`."""
     for names, text in (
         (("--json",), "Print the result as JSON."),
         (("--no-progress",), "Show no progress, as --progress none."),
         (("-v", "--verbose"), "Print more details and the run time."),
     ):
-        command = click.option(
+        function = click.option(
             *names, is_flag=True, expose_value=False, callback=_remember, help=text
-        )(command)
-    return ACTOR(PROGRESS(command))
+        )(function)
+    return ACTOR(PROGRESS(function))
 
 
-def asked(name: str) -> bool:
-    """Whether the running command was given this one of the common options."""
-    return bool(click.get_current_context().meta[name])
+def command(function: Command) -> click.Command:
+    """A command with its own options and, after them, those that every command has."""
+    made = click.command()(function)
+    made.params += click.command()(common(lambda: None)).params
+    return made
+
+
+def asked(name: str) -> Any:
+    """Value of an option that is kept in the context; None if the command does not have it."""
+    return click.get_current_context().meta.get(name)
 
 
 def progress_style() -> str:
     """How the running command shows its progress: bar, json or none."""
-    style = click.get_current_context().meta["progress"]
+    style = asked("progress")
     if asked("no_progress") and style not in (None, "none"):
         raise click.UsageError(
             f"--no-progress and --progress {style} contradict each other; give only one of them"

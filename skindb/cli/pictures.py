@@ -13,14 +13,14 @@ from skindb.cli.options import (
     GENERATION,
     PATH,
     PORT,
+    SCHEDULER,
     TAKE,
     WORKERS,
     asked,
-    common,
+    command,
     options_of,
 )
 from skindb.cli.shared import (
-    SCHEDULER,
     aligned,
     chosen_takes,
     each_take,
@@ -44,7 +44,7 @@ from skindb.parameters import (
 TAKES = click.argument("takes", metavar="[TAKE...]", nargs=-1)
 
 
-@click.command()
+@command
 @DB
 @TAKES
 @click.option(
@@ -64,14 +64,11 @@ TAKES = click.argument("takes", metavar="[TAKE...]", nargs=-1)
 )
 @WORKERS
 @SCHEDULER
-@common
 def render(
     db: str,
     takes: tuple[str, ...],
     out: Path,
     edited: bool,
-    workers: int,
-    scheduler: str | None,
     parameters: RenderParameters,
     **request: Any,
 ) -> None:
@@ -88,7 +85,7 @@ def render(
     call = partial(
         skindb.workflow.render_take,
         database,
-        shared_path(out, scheduler),
+        shared_path(out),
         **request,
         **vars(parameters),
     )
@@ -97,8 +94,6 @@ def render(
         results, faults = each_take(
             call,
             chosen,
-            workers=workers,
-            scheduler=scheduler,
             progress=bar(),
             finish=finish,
         )
@@ -125,7 +120,7 @@ def _rendered(
     return report["take"], report, [*(plan if asked("verbose") else []), path + missed]
 
 
-@click.command()
+@command
 @DB
 @TAKE
 @click.option(
@@ -135,7 +130,6 @@ def _rendered(
 )
 @options_of(ComparisonParameters)
 @GENERATION
-@common
 def compare(
     db: str,
     take: str,
@@ -187,7 +181,7 @@ def compare(
     emit(result, lines)
 
 
-@click.command()
+@command
 @DB
 @TAKE
 @click.argument("variable")
@@ -198,7 +192,6 @@ def compare(
     metavar="DIMENSION=LABEL",
     help="Position along a dimension, for example channel=G (may be given several times).",
 )
-@common
 def show(db: str, take: str, variable: str, out: Path, at: tuple[str, ...]) -> None:
     """Draw a variable of the surfels on the face.
 
@@ -211,7 +204,7 @@ def show(db: str, take: str, variable: str, out: Path, at: tuple[str, ...]) -> N
     emit(report, [report["path"]])
 
 
-@click.command()
+@command
 @DB
 @TAKES
 @click.option(
@@ -225,15 +218,12 @@ def show(db: str, take: str, variable: str, out: Path, at: tuple[str, ...]) -> N
 @GENERATION
 @WORKERS
 @SCHEDULER
-@common
 def export(
     db: str,
     takes: tuple[str, ...],
     out: Path,
     edited: bool,
     generation: int | None,
-    workers: int,
-    scheduler: str | None,
     parameters: ExportParameters,
 ) -> None:
     """Export models, by default all, for other programs.
@@ -259,7 +249,7 @@ def export(
     call = partial(
         skindb.workflow.export_take,
         database,
-        shared_path(out, scheduler),
+        shared_path(out),
         progress=progress,
         **options,
     )
@@ -267,8 +257,6 @@ def export(
         results, faults = each_take(
             call,
             chosen,
-            workers=workers,
-            scheduler=scheduler,
             progress=progress,
             finish=_exported,
         )
@@ -288,7 +276,7 @@ def _label(text: str) -> tuple[str, str]:
     return name, label
 
 
-@click.command()
+@command
 @DB
 @click.argument("takes", metavar="[TAKE...]", nargs=-1)
 @click.option(
@@ -303,7 +291,6 @@ def _label(text: str) -> tuple[str, str]:
     is_flag=True,
     help="Only report what the pages skip and approximate, with error bounds.",
 )
-@common
 def view(
     db: str,
     takes: tuple[str, ...],

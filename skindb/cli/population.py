@@ -8,16 +8,17 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import skindb
-from skindb.cli.options import DB, PATH, TAKE, WORKERS, common, options_of
-from skindb.cli.shared import (
+from skindb.cli.options import (
+    DB,
+    PATH,
     SCHEDULER,
-    aligned,
-    client_of,
-    emit,
-    existing,
-    trait_amounts,
-    writable,
+    TAKE,
+    WORKERS,
+    asked,
+    command,
+    options_of,
 )
+from skindb.cli.shared import aligned, cluster, emit, existing, trait_amounts, writable
 from skindb.cli.terminal import bar
 from skindb.parameters import EditParameters
 
@@ -30,7 +31,7 @@ MAX_EDIT_DISTANCE = 1.0  # to the nearest take, in median distances between take
 EXTRAPOLATED = "the edit is outside the data, and its result is not reliable"
 
 
-@click.command()
+@command
 @DB
 @click.option(
     "--take",
@@ -45,13 +46,10 @@ EXTRAPOLATED = "the edit is outside the data, and its result is not reliable"
 )
 @WORKERS
 @SCHEDULER
-@common
 def register(
     db: str,
     takes: tuple[str, ...],
     reference: str | None,
-    workers: int,
-    scheduler: str | None,
 ) -> None:
     """Warp the fitted takes into a common (u, v) by landmarks.
 
@@ -60,12 +58,12 @@ def register(
     database = existing(db)
     workflow = skindb.workflow
     progress = bar()
-    with client_of(scheduler, progress) as client:
+    with cluster(progress) as client:
         records = workflow.register_takes(
             database,
             takes=takes or None,
             reference=reference,
-            workers=workers,
+            workers=asked("workers"),
             client=client,
             progress=progress,
         )
@@ -94,7 +92,7 @@ def register(
     emit(report, [*aligned([header, *rows]), *skindb.schema.note_lines(doubts), *lines])
 
 
-@click.command()
+@command
 @DB
 @TAKE
 @click.option(
@@ -106,7 +104,6 @@ def register(
     ),
 )
 @options_of(EditParameters)
-@common
 def edit(db: str, take: str, grid: Path | None, parameters: EditParameters) -> None:
     """Move a model along traits and store the result.
 

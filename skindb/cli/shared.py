@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import click
-from click.core import ParameterSource
 
 import skindb
 from skindb.cli.options import asked
@@ -39,35 +38,12 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
-def _refuse_both(
-    ctx: click.Context, _: click.Parameter, scheduler: str | None
-) -> str | None:
-    if (
-        scheduler is not None
-        and ctx.get_parameter_source("workers") is ParameterSource.COMMANDLINE
-    ):
-        raise click.UsageError(
-            "--workers starts local processes and --scheduler uses a cluster; give only one of them"
-        )
-    return scheduler
-
-
-SCHEDULER = click.option(
-    "--scheduler",
-    metavar="ADDRESS",
-    callback=_refuse_both,
-    help=(
-        "Dask scheduler whose workers process the takes: tcp://HOST:PORT, or the .json "
-        "file that it wrote."
-    ),
-)
-
-
 @contextmanager
-def client_of(scheduler: str | None, progress: Progress) -> Iterator[Client | None]:
-    """Client of the named scheduler, whose dashboard is reported; None if no scheduler
+def cluster(progress: Progress) -> Iterator[Client | None]:
+    """Client of the scheduler that was named, whose dashboard is reported; None if none
     was named.
     """
+    scheduler = asked("scheduler")
     if scheduler is None:
         yield None
         return
@@ -83,11 +59,11 @@ def client_of(scheduler: str | None, progress: Progress) -> Iterator[Client | No
         yield client
 
 
-def shared_path(path: P, scheduler: str | None) -> P:
+def shared_path(path: P) -> P:
     """A path that is valid for workers of a cluster, whose working folders differ from
     that of this process.
     """
-    return path if scheduler is None or path is None else path.absolute()
+    return path.absolute() if path and asked("scheduler") else path
 
 
 class UnfinishedError(InputError):
@@ -109,10 +85,7 @@ def emit(result: Any, lines: list[str], faults: Sequence[Fault] = ()) -> None:
     elif lines:
         echo(*lines)
     if asked("verbose"):
-        echo(
-            f"{time.monotonic() - click.get_current_context().meta['since']:.1f} s",
-            err=True,
-        )
+        echo(f"{time.monotonic() - asked('since'):.1f} s", err=True)
     if faults:
         raise InputError(faults)
 
@@ -152,8 +125,6 @@ def each_take(
     function: Callable[[T], R],
     takes: Sequence[T],
     *,
-    workers: int = 1,
-    scheduler: str | None = None,
     shared: Path | None = None,
     progress: Progress,
     finish: Callable[[R], tuple[str, Any, list[str]]],
@@ -163,10 +134,8 @@ def each_take(
 
     Parameters
     ----------
-    function, takes, workers, shared
+    function, takes, shared
         See `skindb.workflow.map_takes`.
-    scheduler
-        Address of a Dask scheduler.
     progress
         Progress to which `function` reports its stages.
     finish
@@ -175,50 +144,46 @@ def each_take(
     """
     results: dict[str, Any] = {}
     faults: list[Fault] = []
+    workers = asked("workers") or 1
     # so that the running take is known
-    in_turn = scheduler is None and (workers == 1 or len(takes) == 1)
+    in_turn = not asked("scheduler") and (workers == 1 or len(takes) == 1)
     following = iter([*map(str, takes[1:]), ""]) if in_turn else repeat("")
     progress.begin_takes(len(takes), take=str(takes[0]) if takes and in_turn else "")
     try:
-        for outcome in _outcomes(function, takes, workers, scheduler, shared, progress):
-            name = str(outcome.take)
-            if outcome.attempts > 1:
-                echo(
-                    f"{name}: a worker process was killed; the take was started again",
-                    err=True,
-                )
-            if outcome.error is not None:
-                errors = skindb.workflow.faults_of(outcome)
-                faults += [_placed(fault, name) for fault in dict.fromkeys(errors)]
-                if outcome.traceback and asked("verbose"):
-                    echo(*outcome.traceback.splitlines(), err=True)
-            else:
-                name, result, lines = finish(outcome.result())
-                results[name] = result
-                if lines and not asked("json"):
-                    echo(*lines)
-            progress.end_take(
-                name, failed=outcome.error is not None, following=next(following)
-            )
+        with cluster(progress) as client:
+            for outcome in skindb.workflow.map_takes(
+                function, takes, workers=workers, client=client, shared=shared
+            ):
+                name, result = _finished(outcome, finish)
+                if outcome.error is None:
+                    results[name] = result
+                else:
+                    faults += result
+                has_failed = outcome.error is not None
+                progress.end_take(name, failed=has_failed, following=next(following))
     except InputError as error:  # of the cluster: no other take can be processed
         faults += error.faults
     return results, faults
 
 
-def _outcomes(
-    function: Callable[[T], R],
-    takes: Sequence[T],
-    workers: int,
-    scheduler: str | None,
-    shared: Path | None,
-    progress: Progress,
-) -> Iterator[Outcome[T, R]]:
-    if not takes:
-        return
-    with client_of(scheduler, progress) as client:
-        yield from skindb.workflow.map_takes(
-            function, takes, workers=workers, client=client, shared=shared
+def _finished(
+    outcome: Outcome[T, R], finish: Callable[[R], tuple[str, Any, list[str]]]
+) -> tuple[str, Any]:
+    """Name of a take, and what --json prints of it, or its faults; its lines are printed."""
+    name = str(outcome.take)
+    if outcome.attempts > 1:
+        echo(
+            f"{name}: a worker process was killed; the take was started again", err=True
         )
+    if outcome.error is None:
+        name, result, lines = finish(outcome.result())
+        if not asked("json"):
+            echo(*lines)
+        return name, result
+    if outcome.traceback and asked("verbose"):
+        echo(*outcome.traceback.splitlines(), err=True)
+    faults = dict.fromkeys(skindb.workflow.faults_of(outcome))
+    return name, [_placed(fault, name) for fault in faults]
 
 
 def _placed(fault: Fault, item: str) -> Fault:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ast
 import importlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, partial
@@ -20,16 +20,8 @@ import click
 
 import skindb
 from skindb import parameters as parameter_module
-from skindb.cli.options import DB, PATH, common, options_of
-from skindb.cli.shared import (
-    SCHEDULER,
-    aligned,
-    client_of,
-    emit,
-    existing,
-    shared_path,
-    writable,
-)
+from skindb.cli.options import DB, PATH, SCHEDULER, common, options_of
+from skindb.cli.shared import aligned, cluster, emit, existing, shared_path, writable
 from skindb.cli.terminal import bar
 from skindb.files import csv_text, private_file
 
@@ -198,7 +190,7 @@ def analyze(ctx: click.Context, db: str) -> None:
 
 def _study_command(study: Declaration) -> click.Command:
     """The command of one study, with the options of its parameters."""
-    run = partial(_run_study, study)
+    run: Callable[..., Any] = partial(_run_study, study)
     for add in reversed(
         (TAKES, options_of(study.parameters), *STORED, SCHEDULER, common)
     ):
@@ -216,7 +208,6 @@ def _run_study(
     parameters: Any,
     release: str | None,
     name: str | None,
-    scheduler: str | None,
     csv: Path | None,
     **drawn: Any,
 ) -> None:
@@ -230,7 +221,7 @@ def _run_study(
         names = ",".join(chosen["adjust"]).split(",")
         chosen["adjust"] = tuple(name.strip() for name in names if name.strip())
     if "dictionary" in chosen:
-        chosen["dictionary"] = shared_path(chosen["dictionary"], scheduler)
+        chosen["dictionary"] = shared_path(chosen["dictionary"])
     database = existing(click.get_current_context().obj)
     progress = bar()
     progress(f"analyze {study.name}", 0, 1)
@@ -240,7 +231,7 @@ def _run_study(
         database, "study", studied, what=study.name, arguments=arguments
     ):
         with (
-            client_of(scheduler, progress) as client,
+            cluster(progress) as client,
             skindb.workflow.computing_on(client, database.folder),
         ):
             results = skindb.workflow.study(

@@ -9,15 +9,17 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import skindb
-from skindb.cli.options import DB, DICTIONARY, PATH, WAIT, WORKERS, common
-from skindb.cli.shared import (
+from skindb.cli.options import (
+    DB,
+    DICTIONARY,
+    PATH,
     SCHEDULER,
-    client_of,
-    emit,
-    existing,
-    require_folder,
-    shared_path,
+    WAIT,
+    WORKERS,
+    asked,
+    command,
 )
+from skindb.cli.shared import cluster, emit, existing, require_folder, shared_path
 from skindb.cli.terminal import bar, confirm, echo
 from skindb.errors import few_names, input_error
 
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
     from skindb.workflow import Refreshed, Withdrawal
 
 
-@click.command()
+@command
 @DB
 @click.argument("subject")
 @click.option(
@@ -37,7 +39,6 @@ if TYPE_CHECKING:
         "none.  [default: only show them]"
     ),
 )
-@common
 def consent(db: str, subject: str, scope: str | None) -> None:
     """Show or record the consent of a subject.
 
@@ -68,7 +69,7 @@ def consent(db: str, subject: str, scope: str | None) -> None:
     )
 
 
-@click.command()
+@command
 @DB
 @click.argument("name", required=False)
 @click.option(
@@ -81,7 +82,6 @@ def consent(db: str, subject: str, scope: str | None) -> None:
     "--where",
     help="Condition that takes must fulfil, for example: condition == 'normal' and age > 40.",
 )
-@common
 def release(
     db: str, name: str | None, takes: tuple[str, ...], where: str | None
 ) -> None:
@@ -117,7 +117,7 @@ def _released(database: Database, name: str) -> dict[str, Any]:
     return {"created": record.created, "revision": record.generation, "takes": takes}
 
 
-@click.command()
+@command
 @DB
 @DICTIONARY
 @WAIT
@@ -128,13 +128,10 @@ def _released(database: Database, name: str) -> dict[str, Any]:
     is_flag=True,
     help="Only list the results that are out of date, and the reasons.",
 )
-@common
 def refresh(
     db: str,
     dictionary: Path | None,
     wait: float,
-    workers: int,
-    scheduler: str | None,
     dry_run: bool,
 ) -> None:
     """Compute results that are out of date again.
@@ -149,12 +146,12 @@ def refresh(
     if dry_run:
         results = workflow.stale_results(database)
     else:
-        dictionary = shared_path(dictionary, scheduler)
-        with client_of(scheduler, progress) as client:
+        dictionary = shared_path(dictionary)
+        with cluster(progress) as client:
             results = workflow.refresh(
                 database,
                 dictionary=dictionary,
-                workers=workers,
+                workers=asked("workers"),
                 client=client,
                 wait=wait,
                 progress=progress,
@@ -189,7 +186,7 @@ def _line(result: Refreshed) -> str:
     )
 
 
-@click.command()
+@command
 @DB
 @click.argument("subject")
 @DICTIONARY
@@ -215,7 +212,6 @@ def _line(result: Refreshed) -> str:
         "NAME.json."
     ),
 )
-@common
 def withdraw(
     db: str,
     subject: str,

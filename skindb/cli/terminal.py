@@ -7,13 +7,13 @@ from __future__ import annotations
 import json
 import sys
 import time
+from dataclasses import dataclass, field
 
 import click
 
 from skindb.cli.options import progress_style
 from skindb.errors import escaped
 
-Pace = tuple[float | None, float | None]  # steps per minute, and seconds left
 MIN_INTERVAL_S = {"bar": 0.2, "json": 1.0}  # between two reports of the same stage
 
 
@@ -40,6 +40,28 @@ def wait_for_enter(text: str) -> None:
     click.prompt(escaped(text), default="", show_default=False)
 
 
+@dataclass
+class Count:
+    """Steps that are done of a total, and the time since the first of them began."""
+
+    total: int = 0
+    done: int = 0
+    skipped: int = 0  # done before
+    begin: float = field(default_factory=time.monotonic)
+
+    @property
+    def rate_per_minute(self) -> float | None:
+        """Steps per minute; None before the first."""
+        steps = self.done - self.skipped
+        return 60 * steps / max(time.monotonic() - self.begin, 1e-9) if steps else None
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Seconds until all are done; None before the first."""
+        rate = self.rate_per_minute
+        return 60 * (self.total - self.done) / rate if rate else None
+
+
 class Progress:
     """Report the stages and takes of a command in the chosen style.
 
@@ -55,47 +77,43 @@ class Progress:
         self.bars = style == "bar" and moving
         self.plain = style == "bar" and plain and not moving
         self.stage = ""
-        self.steps_before = 0  # done when the stage began
+        self.steps = Count()  # of the stage
         self.last_report = 0.0
-        self.reported = (-1, 0)
-        self.begin = time.monotonic()
-        self.stage_begin = self.begin
         self.take = ""
-        self.takes_done = 0
-        self.takes_total = 0
+        self.takes = Count()
 
     def __reduce__(self) -> tuple[type[Progress], tuple[str]]:
         return Progress, ("none",)
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         """Report that `done` of `total` steps of `stage` are finished."""
-        now = time.monotonic()
-        is_new = stage != self.stage
-        if is_new:
+        before = (self.steps.done, self.steps.total)
+        if stage != self.stage:
             self.stage = stage
-            self.stage_begin = now
-            self.steps_before = done
-            self.reported = (-1, 0)
+            self.steps = Count(skipped=done)
+            self.last_report = 0.0
+            before = (-1, 0)
             if self.plain:
                 echo(stage, err=True)
-        interval = MIN_INTERVAL_S.get(self.style, 0.0)
-        is_early = now - self.last_report < interval and done < total
-        if self.style == "json":
-            if (is_new or not is_early) and (done, total) != self.reported:
-                self.last_report = now
-                self.reported = (done, total)
-                self._line(stage, done, total)
-        elif self.bars and not is_early:
-            self.last_report = now
-            self._bar(stage, done, total)
+        self.steps.done = done
+        self.steps.total = total
+        now = time.monotonic()
+        if (
+            now - self.last_report < MIN_INTERVAL_S.get(self.style, 0.0)
+            and done < total
+        ):
+            return
+        if self.style == "json" and (done, total) != before:
+            self._line(stage, self.steps)
+        elif self.bars:
+            self._bar()
+        self.last_report = now
 
     def begin_takes(self, count: int, *, take: str = "") -> None:
         """Start to count finished takes; `take` is the one that is processed now, if
         it is known.
         """
-        self.begin = time.monotonic()
-        self.takes_done = 0
-        self.takes_total = count
+        self.takes = Count(count)
         self.take = take
 
     def end_take(self, take: str, *, failed: bool, following: str = "") -> None:
@@ -103,13 +121,14 @@ class Progress:
         next, if it is known.
         """
         self.take = take
-        self.takes_done = self.takes_done + 1
+        self.takes.done += 1
         if self.style == "json":
-            self._line("failed" if failed else "finished", 1, 1)
-        elif self.bars and self.takes_total > 1:
-            rate, seconds_left = self._pace_of_takes()
-            pace = f"{rate:.3g} takes per minute, {seconds_left:.0f} s left"
-            echo(f"take {self.takes_done} of {self.takes_total}: {pace}", err=True)
+            done = Count(1, 1, begin=self.steps.begin)
+            self._line("failed" if failed else "finished", done)
+        elif self.bars and self.takes.total > 1:
+            rate = self.takes.rate_per_minute
+            pace = f"{rate:.3g} takes per minute, {self.takes.seconds_left:.0f} s left"
+            echo(f"take {self.takes.done} of {self.takes.total}: {pace}", err=True)
         self.take = following
         self.stage = ""
 
@@ -120,53 +139,36 @@ class Progress:
         elif self.style == "bar":
             echo(f"dashboard: {link}", err=True)
 
-    def _bar(self, stage: str, done: int, total: int) -> None:
-        _, seconds_left = self._pace_of_stage(done, total)
-        bar = "#" * round(24 * done / max(total, 1))
-        prefix = (
-            f"take {self.takes_done + 1} of {self.takes_total}: "
-            if self.takes_total > 1
-            else ""
-        )
-        redraw(
-            f"{prefix + stage:<44.44} [{bar:<24}] {done}/{total} {seconds_left or 0:4.0f} s left",
-            ends_line=done >= total,
-        )
+    def _bar(self) -> None:
+        steps = self.steps
+        bar = "#" * round(24 * steps.done / max(steps.total, 1))
+        stage = self.stage
+        if self.takes.total > 1:
+            stage = f"take {self.takes.done + 1} of {self.takes.total}: {stage}"
+        left = steps.seconds_left or 0
+        count = f"{steps.done}/{steps.total} {left:4.0f} s left"
+        text = f"{stage:<44.44} [{bar:<24}] {count}"
+        redraw(text, ends_line=steps.done >= steps.total)
 
-    def _line(self, stage: str, done: int, total: int) -> None:
+    def _line(self, stage: str, steps: Count) -> None:
         """Print a line of JSON; rate and remaining time refer to the takes if there are
         several, else to the stage.
         """
-        rate, seconds_left = self._pace_of_stage(done, total)
-        if self.takes_total > 1:
-            rate, seconds_left = self._pace_of_takes()
+        counted = self.takes if self.takes.total > 1 else steps
+        rate = counted.rate_per_minute
+        left = counted.seconds_left
         report = {
             "take": self.take or None,
             "stage": stage,
-            "done": done,
-            "total": total,
-            "takes_done": self.takes_done,
-            "takes_total": self.takes_total,
-            "seconds": round(time.monotonic() - self.begin, 2),
-            "rate_per_minute": rate and round(rate, 3),
-            "seconds_left": None if seconds_left is None else round(seconds_left, 1),
+            "done": steps.done,
+            "total": steps.total,
+            "takes_done": self.takes.done,
+            "takes_total": self.takes.total,
+            "seconds": round(time.monotonic() - self.takes.begin, 2),
+            "rate_per_minute": None if rate is None else round(rate, 3),
+            "seconds_left": None if left is None else round(left, 1),
         }
         echo(json.dumps(report), err=True)
-
-    def _pace_of_takes(self) -> Pace:
-        seconds = time.monotonic() - self.begin
-        return _pace(self.takes_done, self.takes_total, seconds)
-
-    def _pace_of_stage(self, done: int, total: int) -> Pace:
-        seconds = time.monotonic() - self.stage_begin
-        return _pace(done - self.steps_before, total - self.steps_before, seconds)
-
-
-def _pace(done: int, total: int, seconds: float) -> Pace:
-    """Steps per minute, and seconds until all are done; None before the first step."""
-    if not done:
-        return None, None
-    return 60 * done / max(seconds, 1e-9), (total - done) * seconds / done
 
 
 def bar(*, plain: bool = False) -> Progress:

@@ -14,7 +14,7 @@ import click
 
 import skindb
 from skindb.bench import KERNELS
-from skindb.cli.options import DB, PATH, asked, common
+from skindb.cli.options import DB, PATH, asked, command
 from skindb.cli.shared import (
     aligned,
     calibrated_by_lines,
@@ -37,7 +37,7 @@ ATLAS_WEIGHTS = {
 }
 
 
-@click.command()
+@command
 @DB
 @click.option(
     "--where",
@@ -46,7 +46,6 @@ ATLAS_WEIGHTS = {
 @click.option(
     "--release", metavar="NAME", help="Release whose takes and versions are listed."
 )
-@common
 def info(db: str, where: str | None, release: str | None) -> None:
     """List takes and their versions with paths and sizes.
 
@@ -198,9 +197,8 @@ def _capture_lines(database: Database, take: str) -> list[str]:
 DETAILS = {"capture": _capture_lines, "model": _prediction_lines}
 
 
-@click.command()
+@command
 @DB
-@common
 def verify(db: str) -> None:
     """Read every file of every version and report all damage.
 
@@ -220,7 +218,7 @@ def verify(db: str) -> None:
     emit(report, [*([] if faults else ["Every version is intact."]), *lines], faults)
 
 
-@click.command()
+@command
 @DB
 @click.option(
     "--subject",
@@ -230,7 +228,6 @@ def verify(db: str) -> None:
     "--where",
     help="Condition that entries must fulfil, for example: action == 'export' and subjects > 1.",
 )
-@common
 def audit(db: str, subject: str | None, where: str | None) -> None:
     """List who changed or disclosed data, and check the audit log.
 
@@ -262,7 +259,7 @@ def _pairs(values: Mapping[str, Any]) -> str:
     )
 
 
-@click.command()
+@command
 @DB
 @click.option(
     "--generations",
@@ -272,7 +269,6 @@ def _pairs(values: Mapping[str, Any]) -> str:
     "that is kept was made from them.",
 )
 @click.option("--yes", is_flag=True, help="Remove the garbage instead of listing it.")
-@common
 def clean(db: str, generations: int | None, yes: bool) -> None:
     """List or remove garbage, to which no record refers.
 
@@ -309,7 +305,7 @@ def _garbage_line(item: Garbage) -> str:
     )
 
 
-@click.command()
+@command
 @click.option(
     "--out", type=PATH, default=Path("bench"), help="Folder for bench.json and plots."
 )
@@ -324,7 +320,6 @@ def _garbage_line(item: Garbage) -> str:
     is_flag=True,
     help="Measure smaller problems, which takes half a minute instead of several minutes.",
 )
-@common
 def bench(out: Path, only: tuple[str, ...], quick: bool) -> None:
     """Measure error against run time of every kernel.
 
@@ -341,7 +336,7 @@ def bench(out: Path, only: tuple[str, ...], quick: bool) -> None:
     emit(result, [*table, "", *failures, str(out / "bench.json")], faults)
 
 
-@click.command()
+@command
 @DB
 @click.argument("destination", metavar="BACKUP")
 @click.option(
@@ -349,7 +344,6 @@ def bench(out: Path, only: tuple[str, ...], quick: bool) -> None:
     is_flag=True,
     help="Read the whole backup again, and name every damaged file.",
 )
-@common
 def backup(db: str, destination: str, verify: bool) -> None:
     """Write the present state of a database to BACKUP, a folder or a bucket.
 
@@ -366,7 +360,7 @@ def backup(db: str, destination: str, verify: bool) -> None:
     emit(_as_json(report), lines, report.faults)
 
 
-@click.command()
+@command
 @click.argument("source", metavar="BACKUP")
 @click.argument("db", metavar="DB", required=False)
 @click.option(
@@ -395,7 +389,6 @@ def backup(db: str, destination: str, verify: bool) -> None:
         "backup then come back."
     ),
 )
-@common
 def restore(
     source: str,
     db: str | None,
