@@ -17,7 +17,7 @@ from collections import Counter
 
 import numpy as np
 
-from skindb.analysis.brdf import choose_size, size_status, surfel_errors
+from skindb.analysis.brdf import choose_size, surfel_errors
 from skindb.reflectance.dictionary import embedded_dictionary
 from skindb.reflectance.mixture import basis_rows
 from skindb.reflectance.reduction import Systems, factor_reflectance, residuals
@@ -124,7 +124,7 @@ def main(
         print(
             f"planted {size} ({truth:.4f}), noise {noise:.0%}, least important "
             f"component {needed - 1:6.1%}: "
-            f"{size_status(lower, upper).split(':')[0]}; curve",
+            f"{lower} to {upper or 'unknown'}; curve",
             *(f"{e:.4f}" for e in error),
             flush=True,
         )

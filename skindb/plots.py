@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
 
 from skindb.types import Array, Mask
 
@@ -61,28 +64,44 @@ def legend_beside(ax: Axes) -> None:
     ax.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
 
 
-def significance_bars(
+def intervals(
     ax: Axes,
-    values: Array,
+    table: xr.Dataset,
+    name: str,
     places: Array,
-    bars: Array,
+    *,
+    vertical: bool = False,
+    **style: Any,
+) -> None:
+    """A variable (n,) at places (n,), with bars to the ends of its intervals, the
+    variables with "_low" and "_high" after the name; none where these are NaN.
+    """
+    values, low, high = (table[f"{name}{end}"].values for end in ("", "_low", "_high"))
+    bars = np.maximum(np.nan_to_num([values - low, high - values]), 0.0)
+    style = {"markersize": 5, "capsize": 2, "linewidth": 1} | style
+    if vertical:
+        ax.errorbar(places, values, yerr=bars, **style)
+    else:
+        ax.errorbar(values, places, xerr=bars, **style)
+
+
+def significant_intervals(
+    ax: Axes,
+    table: xr.Dataset,
+    name: str,
+    places: Array,
     is_significant: Mask,
     *,
     colour: str,
     marker: str = "o",
 ) -> None:
-    """Values (n,) at heights (n,) with bars (2, n) to both sides; filled markers are
-    significant.
-    """
+    """`intervals` whose markers are filled where they are significant."""
     for rows, fill in ((is_significant, colour), (~is_significant, "white")):
-        ax.errorbar(
-            values[rows],
-            places[rows],
-            xerr=bars[:, rows],
-            fmt=marker,
-            color=colour,
-            mfc=fill,
-            markersize=4,
-            capsize=2,
-            linewidth=1,
-        )
+        part = table.isel({table[name].dims[0]: rows})
+        style: dict[str, Any] = {
+            "fmt": marker,
+            "color": colour,
+            "mfc": fill,
+            "markersize": 4,
+        }
+        intervals(ax, part, name, places[rows], **style)

@@ -26,6 +26,7 @@ from skindb.analysis.subjects import grouped, level_error
 from skindb.analysis.summary import SAMPLED
 from skindb.errors import input_error, require
 from skindb.numerics.statistics import SUMMARY, known_mean
+from skindb.numerics.texture import QUANTILES, quantile_levels
 from skindb.parameters import group_option
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
@@ -46,7 +47,6 @@ COLOUR_VARIABLES = (
 BINS = 256
 MAX_LEGEND_ENTRIES = 30  # takes; plots of more lines have no legend
 LINES = ("-", "--", ":", "-.", (0, (1, 3)))
-LEVELS = 256  # values of a quantile function
 # minimum slope of a cumulative sum, so that it can be inverted where a histogram is
 # empty
 SLOPE = 1e-3
@@ -59,7 +59,6 @@ class Colours:
     colour: Array  # (n, 3)
     area: Array  # (n,)
     regions: dict[str, Mask]  # region -> (n,)
-    drawn: frozenset[str]  # regions defined by landmarks and not by the capture
 
 
 def albedo_histograms(
@@ -90,8 +89,7 @@ def albedo_histograms(
     -------
     Dataset
         `colour_mean`, `colour_axis`, `histogram_edge`, `albedo_histogram` (fractions
-        that sum to 1), `albedo_mean`. Attribute `regions_by_landmarks`: region -> takes
-        for which the region is defined by landmarks.
+        that sum to 1), `albedo_mean`.
     """
     require_comparable(cohort, "surfels")
     takes = cohort["take"].values.tolist()
@@ -103,7 +101,6 @@ def albedo_histograms(
     edges = _shared_edges(decorrelated)
     counted = np.full((len(takes), len(regions), 3, BINS), np.nan)
     means = np.full((len(takes), len(regions), 3), np.nan)
-    by_landmarks: dict[str, list[str]] = {}
     for t, (sample, x) in enumerate(zip(samples, decorrelated, strict=True)):
         for r, region in enumerate(regions):
             inside = (
@@ -115,8 +112,6 @@ def albedo_histograms(
             means[t, r] = np.average(
                 sample.colour[inside], axis=0, weights=sample.area[inside]
             )
-            if region in sample.drawn:
-                by_landmarks.setdefault(region, []).append(takes[t])
     return dataset(
         {
             variables.COLOUR_MEAN: mean,
@@ -126,10 +121,7 @@ def albedo_histograms(
             variables.ALBEDO_MEAN: means,
         },
         coords={"take": takes, "region": list(regions), "channel": CHANNELS},
-        attrs={
-            "skipped": skipped_takes(cohort),
-            "regions_by_landmarks": by_landmarks,
-        },
+        attrs={"skipped": skipped_takes(cohort)},
     )
 
 
@@ -137,19 +129,18 @@ def _colours(take: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
     """Sampled surfels of one take of a cohort, with the regions of its capture or those
     defined by landmarks.
     """
+    name = str(take["take"].values)
     good = finite_rows(take[variables.DIFFUSE_REFLECTANCE].values) & (
         take[variables.SURFEL_AREA].values > 0
     )
     if not good.any():
-        name_of_take = str(take["take"].values)
         raise input_error(
-            name_of_take,
+            name,
             "a take of a population must have fitted surfels",
             "none",
             "skip the take or fit it again",
         )
     stored = _masks(take, good)
-    name = take["take"].values.item()
     by_landmark: dict[str, Mask] = {}
     if drawn is not None and name in drawn["take"].values:
         registered = drawn.sel(take=name)
@@ -159,20 +150,15 @@ def _colours(take: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
         )
         require(
             same,
-            str(name),
+            name,
             "regions by landmarks must belong to the sampled surfels",
             "a different sample",
             "open both cohorts with the same seed",
         )
         by_landmark = _masks(registered, good)
-    by_landmarks = frozenset(region for region in by_landmark if region not in stored)
     colour = take[variables.DIFFUSE_REFLECTANCE].values[good].astype(float)
-    return Colours(
-        colour,
-        take[variables.SURFEL_AREA].values[good].astype(float),
-        by_landmark | stored,
-        by_landmarks,
-    )
+    area = take[variables.SURFEL_AREA].values[good].astype(float)
+    return Colours(colour, area, by_landmark | stored)
 
 
 def _masks(take: xr.Dataset, good: Mask) -> dict[str, Mask]:
@@ -281,18 +267,15 @@ def histogram(values: Array, area: Array, edges: Array) -> Array:
 
 
 def quantiles(histograms: Array, edges: Array) -> Array:
-    """Quantile functions (..., axis, LEVELS) of histograms (..., axis, bins); NaN stays NaN."""
+    """Quantile functions (..., axis, QUANTILES) of histograms (..., axis, bins); NaN stays NaN."""
     flat = histograms.reshape(-1, *histograms.shape[-2:])
-    out = np.empty((*flat.shape[:2], LEVELS))
+    out = np.empty((*flat.shape[:2], QUANTILES))
     for i, axis in np.ndindex(flat.shape[:2]):
-        out[i, axis] = np.interp(levels(), cumulative(flat[i, axis]), edges[axis])
+        out[i, axis] = np.interp(
+            quantile_levels(), cumulative(flat[i, axis]), edges[axis]
+        )
     out[np.isnan(flat).any(axis=-1)] = np.nan
-    return out.reshape(*histograms.shape[:-1], LEVELS)
-
-
-def levels() -> Array:
-    """Probabilities (LEVELS,) at which quantile functions are evaluated."""
-    return (np.arange(LEVELS) + 0.5) / LEVELS
+    return out.reshape(*histograms.shape[:-1], QUANTILES)
 
 
 def cumulative(fractions: Array) -> Array:

@@ -6,9 +6,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
@@ -19,6 +18,7 @@ from skindb.analysis.study import (
     Population,
     Results,
     Study,
+    Table,
     each_item,
     each_take,
     shared_once,
@@ -60,12 +60,11 @@ BLOCK = 128  # surfels at a time: rows of 2,400 samples and 59 bases take 72 MB
 STEP = 0.003
 TABLE_HEADER = (
     "k",
-    "error [% of that with all bases]",
+    "error above that with all bases [%]",
     "low [%]",
     "high [%]",
-    "error / error of next k",
+    "reduced by next k [%]",
 )
-MAX_DECIMALS = 6  # of the percentages in the table
 STUDY_SURFELS = 200  # of each take, that the study draws
 # surfels of all takes together from which the bases are computed: 56 MB of normal
 # equations
@@ -301,8 +300,7 @@ def basis_size_curve(
             np.sqrt(errors[:, 0, -1].sum() / errors[:, 2, -1].sum())
         ),
     }
-    attrs = {"size_status": size_status(fewest, upper), "surfels": len(errors)}
-    attrs["skipped"] = skipped_takes(cohort)
+    attrs = {"surfels": len(errors), "skipped": skipped_takes(cohort)}
     return dataset(values, coords={"k": ks}, attrs=attrs)
 
 
@@ -371,17 +369,7 @@ def _first_on_plateau(ratios: Array, sizes: int, tolerance: float) -> int:
     return int(np.argmax((ratios[:sizes] <= 1 + tolerance) & (steepest <= 1 + STEP)))
 
 
-def size_status(fewest: int, largest: int) -> str:
-    """The result of `choose_size` as a sentence."""
-    if not largest:
-        return f"at least {fewest}: the error has no plateau within the sizes tried"
-    beyond = f"no further basis reduces the error by more than {STEP:.1%}"
-    if fewest < largest:
-        return f"{fewest} to {largest}: the sample does not distinguish these sizes; {beyond}"
-    return f"{largest}: smaller sizes are significantly worse; {beyond}"
-
-
-def tabulate_basis_size(curve: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
+def tabulate_basis_size(curve: xr.Dataset) -> Table:
     """Header and rows of the table of `basis_size_curve`, one row per size.
 
     Parameters
@@ -392,39 +380,16 @@ def tabulate_basis_size(curve: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
     Returns
     -------
     header, rows
-        Size; error in per cent of the error with the whole dictionary, with the ends of
-        its 95 % interval; ratio of the error to that of the next size ("-" for the last
-        one). Numbers are texts with enough decimals to distinguish neighbouring rows.
+        Size; error above that with the whole dictionary in per cent, with the ends of its
+        95 % interval; by how much the next size reduces the error (NaN for the last one).
     """
-    error, low, high = (
-        100 * curve[f"relative_error{end}"].values for end in ("", "_low", "_high")
-    )
-    ratio = error[:-1] / error[1:]
-    digits = _digits_to_differ(error)
-    ratio_digits = _digits_to_differ(ratio, min_digits=4)
-    steps = [*(f"{step:.{ratio_digits}f}" for step in ratio), "-"]
-    rows = [
-        [
-            int(k),
-            *(f"{column[i]:.{digits}f}" for column in (error, low, high)),
-            steps[i],
-        ]
-        for i, k in enumerate(curve["k"].values)
-    ]
-    return list(TABLE_HEADER), rows
-
-
-def _digits_to_differ(values: Array, *, min_digits: int = 2) -> int:
-    """Number of decimals, up to MAX_DECIMALS, with which different neighbours are
-    printed differently.
-    """
-    pairs = [(a, b) for a, b in pairwise(values.tolist()) if a != b]
-    enough = (
-        d
-        for d in range(min_digits, MAX_DECIMALS)
-        if all(f"{a:.{d}f}" != f"{b:.{d}f}" for a, b in pairs)
-    )
-    return next(enough, MAX_DECIMALS)
+    ends = ("", "_low", "_high")
+    error, *interval = (curve[f"relative_error{end}"].values for end in ends)
+    reduction = np.append(1 - error[1:] / error[:-1], np.nan)
+    columns = [error - 1, *(end - 1 for end in interval), reduction]
+    rows = (100 * np.transpose(columns)).tolist()
+    sizes = curve["k"].values.tolist()
+    return list(TABLE_HEADER), [[k, *row] for k, row in zip(sizes, rows, strict=True)]
 
 
 def describe_basis_size(curve: xr.Dataset) -> str:

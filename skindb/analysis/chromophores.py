@@ -539,36 +539,25 @@ def describe_chromophores(axes: xr.Dataset) -> list[str]:
     return [*lines, *axes.attrs["flags"]]
 
 
-def plot_chromophores(
-    statistics: xr.Dataset, *, table: xr.Dataset | None = None, ax: Axes | None = None
-) -> Axes:
+def plot_chromophores(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot mean melanin and haemoglobin of the groups in every region, with 95 % intervals."""
-    regions = [
-        name for name in statistics["region"].values.tolist() if str(name) != "neck"
-    ]
+    regions = [name for name in table["region"].values.tolist() if name != "neck"]
     ax = ax or plots.new_axes(6.5, 1.4 + 0.55 * len(regions))
     ax.axvline(0, color="0.6", linewidth=1)
-    if table is None:
-        raise ValueError("table must be given; pass the result of chromophore_table")
-    groups = table["group"].values.tolist()
-    colours = dict(zip(CHROMOPHORES, (plots.BLUE, plots.RED), strict=True))
-    lines = list(itertools.product(enumerate(groups), colours))
-    for i, ((g, group), name) in enumerate(lines):
+    groups = enumerate(table["group"].values.tolist())
+    colours = {"melanin": plots.BLUE, "haemoglobin": plots.RED}
+    lines = list(itertools.product(groups, colours.items()))
+    for i, ((g, group), (name, colour)) in enumerate(lines):
         part = table.sel(group=group, chromophore=name, region=regions)
-        mean, low, high = (
-            part[f"group_chromophore_mean{end}"].values for end in ("", "_low", "_high")
-        )
         count = int(part[variables.GROUP_CHROMOPHORE_COUNT].max())
-        ax.errorbar(
-            mean,
+        plots.intervals(
+            ax,
+            part,
+            variables.GROUP_CHROMOPHORE_MEAN,
             np.arange(len(regions)) + 0.7 * ((i + 0.5) / len(lines) - 0.5),
-            xerr=np.nan_to_num([mean - low, high - mean]),
             fmt="osD^v"[g % 5],
-            color=colours[name],
-            mfc="white" if name == CHROMOPHORES[0] else colours[name],
-            markersize=5,
-            capsize=2,
-            linewidth=1,
+            color=colour,
+            mfc="white" if name == CHROMOPHORES[0] else colour,
             label=f"{name}, {group} (n = {count})",
         )
     ax.set_yticks(range(len(regions)), regions)
@@ -621,6 +610,6 @@ STUDY = Study(
     tabulate=lambda _, table: table_of(
         table, COLUMNS, ("group", "region", "chromophore")
     ),
-    plot=lambda statistics, table: plot_chromophores(statistics, table=table),
+    plot=lambda _, table: plot_chromophores(table),
     describe=lambda axes, _: describe_chromophores(axes),
 )

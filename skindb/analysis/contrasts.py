@@ -44,8 +44,6 @@ FEW = 10
 # multiple correlation from which an attribute counts as confounder: a quarter of the
 # variance
 ASSOCIATED = 0.5
-# of the standardised regressors, above which coefficients can hardly be separated
-MAX_CONDITION_NUMBER = 30.0
 
 
 def contrast_arguments(parameters: ContrastParameters) -> dict[str, Any]:
@@ -333,7 +331,6 @@ def contrast_flags(
         flags += _confounders(associated, adjust)
         for name in adjust:
             flags += _extrapolations(contrast, subjects, name)
-        flags += _collinearity(contrast, adjust)
     return [f"{contrast.name}: {flag}" for flag in flags]
 
 
@@ -345,17 +342,6 @@ def _confounders(associated: dict[str, float], adjust: Sequence[str]) -> list[st
         for name, value in associated.items()
         if value >= ASSOCIATED and name not in adjust
     ]
-
-
-def _collinearity(contrast: Contrast, adjust: Sequence[str]) -> list[str]:
-    """A warning if the compared attribute follows from the adjusted ones."""
-    spread = np.column_stack([contrast.regressor, contrast.covariates])
-    spread = (spread - spread.mean(axis=0)) / np.maximum(spread.std(axis=0), 1e-300)
-    number = float(np.linalg.cond(spread))
-    if number <= MAX_CONDITION_NUMBER:
-        return []
-    names = ", ".join(adjust)
-    return [f"can hardly be separated from {names} (condition number {number:.0f})"]
 
 
 def _few_subjects(contrast: Contrast) -> list[str]:

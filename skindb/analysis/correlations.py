@@ -224,27 +224,16 @@ def plot_correlations(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     names = table["pair"].values.tolist()
     ax = ax or plots.new_axes(6.5, 1.0 + 0.24 * len(names))
     ax.axvline(0, color="0.6", linewidth=1)
-    correlations = table[variables.COMPONENT_CORRELATION].values
     place = np.arange(float(len(names)))[::-1]
-    bars = np.stack(
-        [
-            correlations - table[variables.COMPONENT_CORRELATION_LOW].values,
-            table[variables.COMPONENT_CORRELATION_HIGH].values - correlations,
-        ]
-    )
-    bars = np.maximum(np.nan_to_num(bars), 0.0)
+    name = variables.COMPONENT_CORRELATION
     significant = table[variables.CORRELATION_P_FALSE_DISCOVERY].values < 0.05
-    plots.significance_bars(
-        ax, correlations, place, bars, significant, colour=plots.CYCLE[0]
-    )
+    colour = plots.CYCLE[0]
+    plots.significant_intervals(ax, table, name, place, significant, colour=colour)
     ax.set_yticks(place, names, fontsize=7)
     ax.set_xlim(-1, 1)
     count = int(table[variables.CORRELATION_COUNT].max())
-    interval = (
-        ", 95 % CI"
-        if np.isfinite(table[variables.COMPONENT_CORRELATION_LOW].values).any()
-        else ""
-    )
+    has_intervals = table[variables.COMPONENT_CORRELATION_LOW].notnull().any()
+    interval = ", 95 % CI" if has_intervals else ""
     ax.set_xlabel(
         f"correlation between subjects{interval} (n = {count})\nfilled: p < 0.05 "
         "at a false discovery rate of 5 %"

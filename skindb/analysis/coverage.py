@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 from scipy.stats.contingency import association
 
+from skindb import plots
 from skindb.analysis.contrasts import ASSOCIATED, FEW
 from skindb.analysis.study import Population, Results, Study, skipped_takes, table_of
 from skindb.analysis.subjects import (
@@ -38,6 +39,7 @@ AGE_BAND = "age band"
 SITE = "site"
 # factors of which pairs and the triple are counted
 CROSSED = (GENDER, ANCESTRY, AGE_BAND)
+WITH_AGE = (GENDER, ANCESTRY, CONDITION, SITE)  # factors that are crossed with age
 DECADE = 10  # years in an age band
 AND = " x "
 DARK = 0.6  # fraction of the colour scale above which numbers are white
@@ -368,88 +370,47 @@ def plot_coverage(report: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot numbers of subjects by gender and ancestry against age as a table; empty
     cells are white.
     """
-    from matplotlib import pyplot
     from matplotlib.colors import LogNorm
 
-    cells = {
-        tuple(str(name).split(AND)): int(count)
-        for name, count in zip(
-            report["cell"].values, report[variables.COVERAGE_COUNT].values, strict=True
-        )
-    }
-    rows, columns, counts = _plot_table(cells)
-    if ax is None:
-        _, ax = pyplot.subplots(
-            figsize=(2.6 + 0.75 * len(columns), 1.1 + 0.4 * len(rows))
-        )
-    largest = max(int(counts.max()), FEW)
-    norm = LogNorm(0.5, 2 * largest)
+    names: list[tuple[str, ...]] = [
+        tuple(str(name).split(AND)) for name in report["cell"].values
+    ]
+    count_of = dict(
+        zip(map(frozenset, names), report[variables.COVERAGE_COUNT].values, strict=True)
+    )
+    bands = [name for name in names if _factors_of(name) == {AGE_BAND}]
+    rows = [name for name in names if _is_row(name, has_ages=bool(bands))]
+    columns: list[tuple[str, ...]] = bands or [()]
+    counts = np.array(
+        [[count_of[frozenset(row + column)] for column in columns] for row in rows]
+    )
+    ax = ax or plots.new_axes(2.6 + 0.75 * len(columns), 1.1 + 0.4 * len(rows))
+    norm = LogNorm(0.5, 2 * max(int(counts.max()), FEW))
     ax.imshow(np.ma.masked_equal(counts, 0), cmap="Blues", norm=norm, aspect="auto")
-    for i, j in np.ndindex(counts.shape):
-        dark = norm(max(int(counts[i, j]), 1)) > DARK
-        ax.text(
-            j,
-            i,
-            str(counts[i, j]),
-            ha="center",
-            va="center",
-            fontsize=8,
-            color="white" if dark else "black",
-        )
-    ax.set_xticks(range(len(columns)), columns, fontsize=8)
-    ax.set_yticks(range(len(rows)), rows, fontsize=8)
-    has_ages = any(name[0].startswith(AGE_BAND) for name in cells)
-    ax.set_xlabel("age [years]" if has_ages else "subjects")
+    for (i, j), count in np.ndenumerate(counts):
+        colour = "white" if norm(max(count, 1)) > DARK else "black"
+        ax.text(j, i, str(count), ha="center", va="center", fontsize=8, color=colour)
+    labels = [row[0] if len(row) == 1 else _cell_values(row) for row in rows]
+    ages = [_cell_values(column) or "all" for column in columns]
+    ax.set_xticks(range(len(columns)), ages, fontsize=8)
+    ax.set_yticks(range(len(rows)), labels, fontsize=8)
+    ax.set_xlabel("age [years]" if bands else "subjects")
     ax.set_title(f"number of subjects (n = {report.attrs['subjects']})", fontsize=9)
     return ax
 
 
-def _plot_table(
-    cells: Mapping[tuple[str, ...], int],
-) -> tuple[list[str], list[str], Array]:
-    """Row labels, column labels and counts: factors crossed with age, or all values in
-    one column without ages.
+def _factors_of(cell: tuple[str, ...]) -> set[str]:
+    return {part.partition(": ")[0] for part in cell}
+
+
+def _is_row(cell: tuple[str, ...], *, has_ages: bool) -> bool:
+    """Whether a cell is a row of the plot: pairs of gender and ancestry, and values of
+    other factors than age, with ages only of those that are crossed with it.
     """
-    bands = [
-        name[0]
-        for name in cells
-        if len(name) == 1 and name[0].startswith(f"{AGE_BAND}: ")
-    ]
-    without_age = [
-        name
-        for name in cells
-        if len(name) < 3 and not any(part.startswith(AGE_BAND) for part in name)
-    ]
-    kinds = (GENDER, ANCESTRY, CONDITION, SITE)
-    single = [
-        name[0]
-        for name in without_age
-        if len(name) == 1 and (not bands or name[0].partition(":")[0] in kinds)
-    ]
-    pairs = [
-        name
-        for name in without_age
-        if len(name) == 2
-        and {part.partition(":")[0] for part in name} == {GENDER, ANCESTRY}
-    ]
-    if not bands:
-        keys = [*((name,) for name in single), *pairs]
-        return (
-            [_cell_values(key) for key in keys],
-            ["all"],
-            np.array([[cells[key]] for key in keys]),
-        )
-    rows = [*((name,) for name in single), *pairs]
-    table = np.array(
-        [[_cell_count(cells, (*row, band)) for band in bands] for row in rows]
-    )
-    labels = [row[0] if len(row) == 1 else _cell_values(row) for row in rows]
-    return labels, [band.partition(": ")[2] for band in bands], table
-
-
-def _cell_count(cells: Mapping[tuple[str, ...], int], parts: tuple[str, ...]) -> int:
-    """Number of subjects in a crossing, whatever the order of its factors."""
-    return next((count for name, count in cells.items() if set(name) == set(parts)), 0)
+    factors = _factors_of(cell)
+    if len(cell) > 1:
+        return factors == {GENDER, ANCESTRY}
+    return AGE_BAND not in factors and (not has_ages or factors <= {*WITH_AGE})
 
 
 @dataclass(frozen=True)

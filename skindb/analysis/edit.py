@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb.analysis.albedo import cumulative, decorrelate, histogram, levels, quantiles
+from skindb.analysis.albedo import cumulative, decorrelate, histogram, quantiles
 from skindb.analysis.brdf import project
 from skindb.analysis.subjects import trait_name
 from skindb.analysis.texture import at_surfels, edit_texture
 from skindb.errors import Fault, InputError, input_error
-from skindb.numerics.texture import valid_quantiles
+from skindb.numerics.texture import quantile_levels, valid_quantiles
 from skindb.optics.diffusion import dipole_s
 from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, stored_brdf
 from skindb.schema import GROUPS, Use, check, dataset, label, names_of, variables
@@ -581,4 +581,4 @@ def _length(vectors: Array, metric: Array) -> Array:
 def shift_quantiles(values: Array, source: Array, shift: Array, edges: Array) -> Array:
     """Values (n,) plus the shift (levels,) at their quantile of the histogram `source` (bins,)."""
     quantile = np.interp(values, edges, cumulative(source))
-    return np.asarray(values + np.interp(quantile, levels(), shift))
+    return np.asarray(values + np.interp(quantile, quantile_levels(), shift))

@@ -332,26 +332,22 @@ def plot_group_effects(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     contrasts = table["contrast"].values.tolist()
     for i, contrast in enumerate(contrasts):
         part = table.sel(contrast=contrast)
-        effect, low, high, standardised = (
-            part[name].values
-            for name in (
-                variables.EFFECT,
-                variables.EFFECT_LOW,
-                variables.EFFECT_HIGH,
-                variables.EFFECT_STANDARDISED,
-            )
-        )
-        scale = effect / standardised
+        scale = part[variables.EFFECT] / part[variables.EFFECT_STANDARDISED]
+        names_of_effects = [
+            variables.EFFECT,
+            variables.EFFECT_LOW,
+            variables.EFFECT_HIGH,
+        ]
         colour = plots.CYCLE[i % len(plots.CYCLE)]
         marker = "osD^v"[i % 5]
         count = int(part[variables.EFFECT_COUNT].sum("side").max())
         label = f"{contrast} (n = {count})"
         ax.plot([], [], marker, color=colour, markersize=4, label=label)
-        plots.significance_bars(
+        plots.significant_intervals(
             ax,
-            effect / scale,
+            part[names_of_effects] / scale,
+            variables.EFFECT,
             places + 0.6 * ((i + 0.5) / len(contrasts) - 0.5),
-            np.abs(np.stack([effect - low, high - effect]) / scale),
             part[variables.EFFECT_P_ADJUSTED].values < SIGNIFICANT,
             colour=colour,
             marker=marker,

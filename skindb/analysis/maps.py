@@ -20,6 +20,7 @@ from skindb.analysis.study import (
     Table,
     each_take,
     skipped_takes,
+    table_of,
 )
 from skindb.analysis.subjects import notes_on_attributes, subjects_of
 from skindb.errors import Fault, InputError, input_error
@@ -210,33 +211,26 @@ def tabulate_effect_maps(maps: xr.Dataset) -> Table:
     """Header and one row per comparison and quantity: texels, fraction that differs,
     mean and largest effect.
     """
-    header = [
-        "contrast",
-        "quantity",
-        "subjects",
-        "texels",
-        "fraction_that_differs",
-        "mean_effect",
-        "largest_effect",
-    ]
-    rows: list[list[Any]] = []
-    for contrast in maps["contrast"].values.tolist():
-        for quantity in maps["quantity"].values.tolist():
-            part = maps.sel(contrast=contrast, quantity=quantity)
-            effect = part[variables.MAP_EFFECT].values
-            is_known = np.isfinite(part[variables.MAP_EFFECT_P].values)
-            if not is_known.any():
-                rows.append([contrast, quantity, 0, 0, *[float("nan")] * 3])
-                continue
-            differ = (
-                part[variables.MAP_EFFECT_P_ADJUSTED].values[is_known] < SIGNIFICANT
-            )
-            largest = effect[is_known][np.abs(effect[is_known]).argmax()]
-            numbers = (differ.mean(), effect[is_known].mean(), largest)
-            subjects = int(part[variables.MAP_EFFECT_COUNT].values[is_known].max())
-            texels = int(is_known.sum())
-            rows.append([contrast, quantity, subjects, texels, *map(float, numbers)])
-    return header, rows
+    texel = ("v", "u")
+    is_known = maps[variables.MAP_EFFECT_P].notnull()
+    count, effect, p = (
+        maps[name].where(is_known).astype(float)
+        for name in (
+            variables.MAP_EFFECT_COUNT,
+            variables.MAP_EFFECT,
+            variables.MAP_EFFECT_P_ADJUSTED,
+        )
+    )
+    low = effect.min(texel)
+    high = effect.max(texel)
+    columns = {
+        "subjects": count.max(texel).fillna(0).astype(int),
+        "texels": is_known.sum(texel),
+        "fraction_that_differs": (p < SIGNIFICANT).where(is_known).mean(texel),
+        "mean_effect": effect.mean(texel),
+        "largest_effect": high.where(high >= -low, low),
+    }
+    return table_of(maps.assign(columns), list(columns), ("contrast", "quantity"))
 
 
 def describe_effect_maps(maps: xr.Dataset) -> list[str]:
@@ -320,16 +314,11 @@ def _plot_quantity(line: Sequence[Axes], maps: xr.Dataset) -> None:
 
 def _finite_extent(values: Array) -> tuple[slice, slice]:
     """Slices of the rows and columns that contain the finite values of an array (..., v, u)."""
-    is_finite = np.asarray(np.isfinite(values).any(axis=0))
-    extents = []
-    for axis in (1, 0):
-        indices = np.flatnonzero(is_finite.any(axis=axis))
-        extents.append(
-            slice(int(indices[0]), int(indices[-1]) + 1)
-            if indices.size
-            else slice(None)
-        )
-    return extents[0], extents[1]
+    places = np.argwhere(np.isfinite(values).any(axis=0))
+    if not len(places):
+        return slice(None), slice(None)
+    rows, columns = np.stack([places.min(axis=0), places.max(axis=0) + 1], axis=1)
+    return slice(*rows), slice(*columns)
 
 
 @dataclass(frozen=True)

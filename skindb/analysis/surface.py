@@ -16,7 +16,16 @@ from dask.delayed import Delayed
 
 from skindb.analysis.brdf import population_basis
 from skindb.analysis.brdf_plots import plot_space
-from skindb.analysis.study import Population, Results, Study, each_item, skipped_takes
+from skindb.analysis.quantities import Quantities
+from skindb.analysis.study import (
+    Population,
+    Results,
+    Study,
+    Table,
+    each_item,
+    skipped_takes,
+    table_of,
+)
 from skindb.analysis.subjects import (
     NORMAL,
     OTHER,
@@ -311,18 +320,13 @@ def _by_subject(
     takes: Subjects, named: Sequence[str], coefficient: Array, place: Array
 ) -> _Subjects:
     """Average the takes of every subject within each group; the group "normal" is the first."""
-    who = np.array(takes.subject)
-    group = np.array(named)
     groups = sorted(set(named), key=lambda name: (name != NORMAL, name))
-    members = [
-        [(who == s) & (group == g) for g in groups] for s in dict.fromkeys(who.tolist())
-    ]
-    means = [
-        np.stack(
-            [np.stack([known_mean(values[rows]) for rows in row]) for row in members]
-        )
-        for values in (coefficient, place)
-    ]
+    members = [[i for i, name in enumerate(named) if name == g] for g in groups]
+    means = []
+    for values in (coefficient, place):
+        of_takes = Quantities(values, takes.subject)
+        of_groups = [of_takes.select(rows).of_subjects(takes.names) for rows in members]
+        means.append(np.stack([group.values for group in of_groups], axis=1))
     return _Subjects(tuple(groups), *means)
 
 
@@ -355,36 +359,31 @@ def _compared_pair(
     subjects: _Subjects, pair: tuple[int, int], max_draws: int, rng: np.random.Generator
 ) -> _Pair:
     """Compare two groups: within the subjects measured in both, if there are any."""
-    a, b = pair
-    measured = subjects.measured
-    values = subjects.place[:, [a, b]]
-    both = measured[:, a] & measured[:, b]
+    values = subjects.place[:, pair]
+    measured = subjects.measured[:, pair]
+    both = measured.all(axis=1)
     within = bool(both.any())
     if within:
         values = values[both]
-        step = (values[:, 0] - values[:, 1]).mean(axis=0)
-        count = (len(values), len(values))
-    else:
-        step = known_mean(values[:, 0]) - known_mean(values[:, 1])
-        count = (int(measured[:, a].sum()), int(measured[:, b].sum()))
+        measured = measured[both]
+    first, second = measured.sum(axis=0).tolist()
     statistic = np.nan
     p = np.nan
     drawn = 0
-    if min(count) >= 2 and within:
-        (statistic,), (p,), drawn = within_subjects_p(
-            values, max_draws=max_draws, rng=rng
-        )
-    elif min(count) >= 2:
-        places = np.concatenate(
-            [values[measured[:, side], i] for i, side in enumerate(pair)]
-        )
-        (statistic,), (p,), drawn = between_groups_p(
-            places, np.repeat([0, 1], count), max_draws=max_draws, rng=rng
-        )
+    if min(first, second) >= 2:
+        draws: dict[str, Any] = {"max_draws": max_draws, "rng": rng}
+        if within:
+            result = within_subjects_p(values, **draws)
+        else:
+            places = values.swapaxes(0, 1)[measured.T]
+            group = np.repeat([0, 1], (first, second))
+            result = between_groups_p(places, group, **draws)
+        (statistic,), (p,), drawn = result
+    step = known_mean(values[:, 0]) - known_mean(values[:, 1])
     length = float(np.linalg.norm(step))
     noise = length / np.sqrt(statistic) if statistic > 0 else np.nan
-    name = f"{subjects.groups[a]} to {subjects.groups[b]}"
-    return _Pair(name, within, count, length, noise, p, drawn)
+    name = " to ".join(subjects.groups[i] for i in pair)
+    return _Pair(name, within, (first, second), length, noise, p, drawn)
 
 
 def _distances(pairs: Sequence[_Pair], length: float) -> dict[str, Array]:
@@ -424,15 +423,15 @@ def _adjusted(
     return np.maximum(largest, p), "largest statistic"
 
 
-def tabulate_brdf_space(space: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
+def tabulate_brdf_space(space: xr.Dataset) -> Table:
     """Header and rows of the table of `brdf_space`, one row per pair of groups."""
-    counts = space[variables.PAIR_SUBJECT_COUNT].values.tolist()
-    columns = [space[name].values.tolist() for name in COLUMNS]
-    rows = [
-        [str(pair), *counts[i], *(c[i] for c in columns)]
-        for i, pair in enumerate(space["pair"].values)
-    ]
-    return ["pair", *(f"subjects_{side}" for side in SIDES), *COLUMNS], rows
+    counts = {
+        f"subjects_{side}": space[variables.PAIR_SUBJECT_COUNT].sel(
+            side=side, drop=True
+        )
+        for side in SIDES
+    }
+    return table_of(space.assign(counts), [*counts, *COLUMNS], ["pair"])
 
 
 def describe_brdf_space(space: xr.Dataset) -> list[str]:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,8 +54,6 @@ SIDES = ("with", "without")
 # vector
 FEW = 10
 LOG_SIGMA_TR = variables.TRAIT_LOG_SIGMA_TR_SHIFT
-WITHOUT_ERRORS = {variables.TRAIT_HISTOGRAM_SHIFT, variables.TRAIT_TEXTURE_SHIFT}
-MIN_VECTOR_TO_ERROR = 3.0  # recommended ratio of the length of a vector to its error
 RESAMPLES = 200  # of subjects in the bootstrap, which gives standard errors to 5 %
 
 
@@ -226,7 +225,6 @@ def _compared_values(
         variables.TRAIT_BRDF_SHIFT: basis[variables.TAKE_COEFFICIENT]
         .sel(take=takes)
         .values,
-        variables.TRAIT_HISTOGRAM_SHIFT: histograms,
         variables.TRAIT_QUANTILE_SHIFT: quantiles(
             histograms, albedo[variables.HISTOGRAM_EDGE].values
         ),
@@ -246,13 +244,13 @@ def _shifts(
     """Vectors (trait, ...) of all values (take, ...), with their errors by bootstrap."""
     shifts: dict[str, list[Array]] = {name: [] for name in values}
     errors: dict[str, list[Array]] = {
-        f"{name}_error": [] for name in values if name not in WITHOUT_ERRORS
+        f"{name}_error": [] for name in values if name != variables.TRAIT_TEXTURE_SHIFT
     }
     for unit in units:
         count = len(unit.design)
         drawn = rng.multinomial(count, np.full(count, 1 / count), RESAMPLES)
         for name, of_takes in values.items():
-            with_errors = name not in WITHOUT_ERRORS
+            with_errors = name != variables.TRAIT_TEXTURE_SHIFT
             resamples = drawn[: None if with_errors else 0].astype(float)
             shift, resampled = _coefficients(
                 unit.values(of_takes), unit.design, resamples
@@ -304,20 +302,15 @@ def _units(
             tuple(mask & (who == s) for s in pairs) for mask in (carries, lacks)
         )
         return Units(rows, rows_without, np.ones((len(pairs), 1)))
+    others = sorted(set(who[lacks]) - set(pairs))
+    names = [*pairs, *others]
+    rows = tuple((carries if s in pairs else lacks) & (who == s) for s in names)
+    regressor = [1.0] * len(pairs) + [0.0] * len(others)
     if trait in numbers:
         values = number_of_takes(subjects, trait)
-        whose = [
-            (s, float(values[carries & (who == s)][0]), carries & (who == s))
-            for s in pairs
-        ]
-    else:
-        whose = [(s, 1.0, carries & (who == s)) for s in pairs]
-        whose += [
-            (s, 0.0, lacks & (who == s)) for s in sorted(set(who[lacks]) - set(pairs))
-        ]
-    names = [s for s, _, _ in whose]
+        regressor = [float(values[of_subject][0]) for of_subject in rows]
     held = [subjects.by_subject(name, names).columns for name in adjust]
-    design = np.column_stack([[x for _, x, _ in whose], np.ones(len(whose)), *held])
+    design = np.column_stack([regressor, np.ones(len(names)), *held])
     complete = finite_rows(design)
     design = design[complete]
     if np.linalg.matrix_rank(design) < np.linalg.matrix_rank(design[:, 1:]) + 1:
@@ -328,15 +321,7 @@ def _units(
             finding,
             "adjust for fewer attributes, or exclude the trait",
         )
-    return Units(
-        tuple(
-            rows
-            for (_, _, rows), is_complete in zip(whose, complete, strict=True)
-            if is_complete
-        ),
-        (),
-        design,
-    )
+    return Units(tuple(itertools.compress(rows, complete)), (), design)
 
 
 def _coefficients(values: Array, design: Array, drawn: Array) -> tuple[Array, Array]:
@@ -350,17 +335,14 @@ def _coefficients(values: Array, design: Array, drawn: Array) -> tuple[Array, Ar
     resampled = np.full((len(drawn), flat.shape[1]), np.nan)
     for rows, columns in missing_patterns(flat):
         rows_design = design[rows]
-        rank_of_others = (
-            np.linalg.matrix_rank(rows_design[:, 1:]) if rows_design.shape[1] > 1 else 0
-        )
-        if np.linalg.matrix_rank(rows_design) == rank_of_others:
+        rank = np.linalg.matrix_rank(rows_design)
+        others = rows_design[:, 1:]
+        if rank == (np.linalg.matrix_rank(others) if others.size else 0):
             continue
         out[columns] = np.linalg.pinv(rows_design)[0] @ flat[np.ix_(rows, columns)]
         counts = drawn[:, rows]
         square = np.einsum("bi,ip,iq->bpq", counts, rows_design, rows_design)
-        able = np.linalg.matrix_rank(square, hermitian=True) == np.linalg.matrix_rank(
-            rows_design
-        )
+        able = np.linalg.matrix_rank(square, hermitian=True) == rank
         weights = np.einsum(
             "bq,iq,bi->bi",
             np.linalg.pinv(square[able], hermitian=True)[:, 0],
@@ -431,51 +413,33 @@ def _log_sigma_tr(cohort: xr.Dataset) -> Array:
 
 
 def describe_traits(traits: xr.Dataset) -> list[str]:
-    """Flags of trait vectors, and estimates of the number of takes that their colours
-    need, one line each.
+    """Flags of trait vectors, and a line for each whose colours are noise.
 
     The squared length of a measured vector is the sum of the squared length of the true
     vector and that of its error, which is inversely proportional to the number of
     takes.
     """
     lines = list(traits.attrs.get("flags", []))
-    if (
-        variables.TRAIT_QUANTILE_SHIFT_ERROR not in traits
-        or FACE not in traits["region"].values
-    ):
+    if variables.TRAIT_QUANTILE_SHIFT_ERROR not in traits:
+        return lines
+    if FACE not in traits["region"].values:
         return lines
     face = traits.sel(region=FACE)
     for name in traits["trait"].values.tolist():
         part = face.sel(trait=name)
-        error = float(
-            (part[variables.TRAIT_QUANTILE_SHIFT_ERROR] ** 2).sum(skipna=False)
-        )
-        true = (
-            float((part[variables.TRAIT_QUANTILE_SHIFT] ** 2).sum(skipna=False)) - error
+        shift, error = (
+            float((part[variable] ** 2).sum(skipna=False))
+            for variable in (
+                variables.TRAIT_QUANTILE_SHIFT,
+                variables.TRAIT_QUANTILE_SHIFT_ERROR,
+            )
         )
         takes = int(part[variables.TRAIT_COUNT].sum())
-        if not np.isfinite(error):
-            continue
-        if true <= error / takes:
+        if shift - error <= error / takes:
             lines.append(
                 f"{name}: with {takes} takes, the colour vector cannot be distinguished from noise"
             )
-        elif true < MIN_VECTOR_TO_ERROR**2 * error:
-            needed = takes * MIN_VECTOR_TO_ERROR**2 * error / true
-            many = (
-                f"about {_rounded(needed)}"
-                if needed < 10 * takes
-                else f"more than {10 * takes}"
-            )
-            aim = f"for a colour vector {MIN_VECTOR_TO_ERROR:g} times as long as its error"
-            lines.append(f"{name}: {many} takes would be needed {aim}")
     return lines
-
-
-def _rounded(count: float) -> int:
-    """Round an estimate up to two significant digits."""
-    digits = max(int(np.floor(np.log10(count))) - 1, 0)
-    return int(np.ceil(count / 10**digits) * 10**digits)
 
 
 def plot_traits(traits: xr.Dataset, *, ax: Axes | None = None) -> Axes:

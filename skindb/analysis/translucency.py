@@ -59,9 +59,8 @@ def translucency_table(
     -------
     Dataset
         (group, site, channel); NaN where a group has too few values. The interval of
-        the mean is Student's; that of the standard deviation assumes a normal
-        distribution. Errors of single takes differ between takes, so that both
-        intervals and the standard deviation include them. `sigma_tr_measurement_error`
+        the mean is Student's. Errors of single takes differ between takes, so that the
+        interval and the standard deviation include them. `sigma_tr_measurement_error`
         is the RMS of these errors due to the noise of the fibres,
         `sigma_tr_total_error` their RMS including the error of the profile's model; NaN
         where no take has an error. `sigma_tr_people_fraction` is the fraction of the
@@ -91,7 +90,6 @@ def translucency_table(
     )
     moments = groups.moments(sigma_tr)
     variance = moments.variance
-    deviation_low, deviation_high = moments.deviation_interval()
     measurement_error = _rms(groups, noise)
     explained = measurement_error**2 / np.where(variance > 0, variance, np.nan)
     subjects = np.array(groups.subject)
@@ -102,8 +100,6 @@ def translucency_table(
     return dataset(
         {
             **moments.summary("sigma_tr"),
-            variables.SIGMA_TR_DEVIATION_LOW: deviation_low,
-            variables.SIGMA_TR_DEVIATION_HIGH: deviation_high,
             variables.SIGMA_TR_VARIANCE: variance,
             variables.SIGMA_TR_PEOPLE_FRACTION: np.clip(1 - explained, 0.0, 1.0),
             variables.SIGMA_TR_MEASUREMENT_ERROR: measurement_error,
@@ -184,26 +180,17 @@ def plot_translucency(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     for g, group in enumerate(map(str, table["group"].values)):
         for c, colour in enumerate(plots.CHANNELS):
             part = table.isel(group=g, channel=c)
-            x = np.arange(len(sites)) + 0.12 * (c - 1) + 0.03 * g
-            mean = part[variables.SIGMA_TR_MEAN].values
-            # sigma_tr is never negative
-            low = np.maximum(part[variables.SIGMA_TR_MEAN_LOW].values, 0.0)
-            bars = np.nan_to_num(
-                [mean - low, part[variables.SIGMA_TR_MEAN_HIGH].values - mean]
-            )
             count = int(part[variables.SIGMA_TR_COUNT].max())
-            name = f"{table['channel'].values[c]}" + (
-                f", {group}" if table.sizes["group"] > 1 else ""
-            )
-            label = f"{name} (n = {count})"
-            ax.errorbar(
-                x,
-                mean,
-                yerr=bars,
+            of_group = f", {group}" if table.sizes["group"] > 1 else ""
+            plots.intervals(
+                ax,
+                part,
+                variables.SIGMA_TR_MEAN,
+                np.arange(len(sites)) + 0.12 * (c - 1) + 0.03 * g,
+                vertical=True,
                 fmt="os^Dv"[g % 5],
                 color=colour,
-                capsize=3,
-                label=label,
+                label=f"{table['channel'].values[c]}{of_group} (n = {count})",
             )
     ax.set_xticks(range(len(sites)), sites)
     ax.set_ylim(bottom=0)

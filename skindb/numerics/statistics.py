@@ -98,16 +98,6 @@ class Moments:
         half = half * self.standard_deviation / np.sqrt(np.maximum(self.count, 1.0))
         return self.mean - half, self.mean + half
 
-    def deviation_interval(self) -> tuple[Array, Array]:
-        """Chi-square interval of the standard deviation of normal values; NaN for fewer
-        than two values.
-        """
-        freedom = np.maximum(self.count - 1.0, 1.0)
-        second = np.where(self.count > 1, self.second, np.nan)
-        low = np.sqrt(second / stats.chi2.ppf((1 + CONFIDENCE) / 2, freedom))
-        high = np.sqrt(second / stats.chi2.ppf((1 - CONFIDENCE) / 2, freedom))
-        return low, high
-
 
 def bootstrap_interval(
     values: Array,

@@ -27,14 +27,6 @@ SIGMA_TR_STANDARD_DEVIATION = declare(
     "float64 translucency_table/sigma_tr_standard_deviation(group, site, channel) [mm-1]",
     "standard deviation of sigma_tr",
 )
-SIGMA_TR_DEVIATION_LOW = declare(
-    "float64 translucency_table/sigma_tr_deviation_low(group, site, channel) [mm-1]",
-    "lower end of the 95 % interval of the standard deviation",
-)
-SIGMA_TR_DEVIATION_HIGH = declare(
-    "float64 translucency_table/sigma_tr_deviation_high(group, site, channel) [mm-1]",
-    "upper end of the 95 % interval of the standard deviation",
-)
 SIGMA_TR_VARIANCE = declare(
     "float64 translucency_table/sigma_tr_variance(group, site, channel) [mm-2]",
     "unbiased variance of sigma_tr",
@@ -607,11 +599,6 @@ TRAIT_COUNT = declare(
 TRAIT_BRDF_SHIFT = declare(
     "float64 traits/trait_brdf_shift(trait, component) [1]",
     "mean coefficient with the trait minus the mean without",
-    f"{PAPER}, section 11",
-)
-TRAIT_HISTOGRAM_SHIFT = declare(
-    "float64 traits/trait_histogram_shift(trait, region, axis, bin) [1]",
-    "mean histogram with the trait minus the mean without",
     f"{PAPER}, section 11",
 )
 TRAIT_QUANTILE_SHIFT = declare(

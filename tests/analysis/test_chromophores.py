@@ -330,10 +330,8 @@ def test_chromophore_table__the_unit_is_the_subject(planted):
 def test_plot_chromophores__names_groups_and_counts(planted):
     _, maps, axes = planted
     statistics = chromophore_statistics(maps, axes=axes)
-    ax = plot_chromophores(
-        statistics,
-        table=chromophore_table(maps, statistics=statistics, group_by="gender"),
-    )
+    table = chromophore_table(maps, statistics=statistics, group_by="gender")
+    ax = plot_chromophores(table)
     labels = [text.get_text() for text in ax.get_legend().get_texts()]
     assert labels[0] == "melanin, female (n = 2)"
     assert "-ln R_d at green" in ax.get_xlabel()

@@ -15,10 +15,11 @@ from skindb.analysis import (
     plot_traits,
     trait_vectors,
 )
-from skindb.analysis.albedo import levels, quantiles
+from skindb.analysis.albedo import quantiles
 from skindb.analysis.edit import shift_quantiles, valid_quantiles, with_basis
 from skindb.errors import InputError
 from skindb.fit.translucency import translucency_map
+from skindb.numerics.texture import quantile_levels
 from skindb.optics.diffusion import diffuse_reflectance
 from skindb.reflectance.tables import brdf_metric, stored_brdf
 from skindb.schema import dataset
@@ -34,7 +35,6 @@ def test_trait_vectors__planted_differences():
         2.0 * np.mean(np.random.default_rng(1).gamma(4.0, 0.02, (N, 3))[1:, 0]) * H[0]
     )
     np.testing.assert_allclose(change, want, atol=0.15 * np.linalg.norm(want))
-    np.testing.assert_allclose(lotion["trait_histogram_shift"], 0.0, atol=1e-12)
     male = traits.sel(trait="gender:male")["trait_log_sigma_tr_shift"].values
     np.testing.assert_allclose(male, np.log([1.2, 0.8]).mean(), atol=1e-6)
 
@@ -95,7 +95,6 @@ def test_trait_vectors__takes_go_by_name():
     )
     for name in (
         "trait_brdf_shift",
-        "trait_histogram_shift",
         "trait_quantile_shift",
         "trait_log_sigma_tr_shift",
     ):
@@ -368,7 +367,7 @@ def test_quantiles__are_those_of_the_values():
     edges = np.linspace(-1, 20, 257) * np.ones((2, 1))
     shares = np.stack([np.histogram(v, edges[0])[0] / x.shape[1] for v in x])
     found = quantiles(shares, edges)
-    want = np.quantile(x, levels(), axis=1).T
+    want = np.quantile(x, quantile_levels(), axis=1).T
     middle = slice(5, -5)
     # a bin
     np.testing.assert_allclose(found[:, middle], want[:, middle], atol=21 / 256)
@@ -380,7 +379,7 @@ def test_carry__moves_the_mean_and_keeps_the_order():
     edges = np.linspace(-6, 6, 257)
     x = rng.normal(size=5000)
     shares = np.histogram(x, edges)[0] / 5000
-    shift = 0.5 + 0.3 * levels()
+    shift = 0.5 + 0.3 * quantile_levels()
     got = shift_quantiles(x, shares, shift, edges)
     assert (got - x).mean() == pytest.approx(shift.mean(), abs=2e-3)
     assert (np.diff(got[np.argsort(x)]) > 0).all()
