@@ -241,6 +241,21 @@ def package_json(package: str, name: str) -> Any:
     return json.loads((resources.files(package) / name).read_text(encoding="utf-8"))
 
 
+def filled_template(package: str, name: str, **values: Any) -> str:
+    """Text of a Jinja template that stands beside the modules of a package; HTML is escaped."""
+    import jinja2  # takes longer to import than most commands run
+
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader(package, ""),
+        autoescape=jinja2.select_autoescape(["html.jinja"]),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    return environment.get_template(name).render(values)
+
+
 @cache
 def package_digest(root: Path = ROOT) -> str:
     """Digest of all source files of skindb, byte by byte: whether two processes run the
