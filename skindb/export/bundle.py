@@ -6,9 +6,7 @@ import hashlib
 import json
 import shutil
 import uuid
-from collections.abc import Mapping
 from pathlib import Path
-from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -28,7 +26,7 @@ from skindb.export.scenes import (
     export_usd,
 )
 from skindb.export.textures import Skin, skin_of
-from skindb.files import make_private, plain, private_file
+from skindb.files import filled_template, make_private, plain, private_file
 from skindb.reflectance.brdf_files import write_merl, write_tables
 from skindb.reflectance.dictionary import Dictionary
 from skindb.reflectance.kinds import as_mixture
@@ -38,65 +36,6 @@ from skindb.schema import VARIABLES, FitStatus, ProbeStatus, Use, names_of, vari
 from skindb.schema.consent import require_consent
 from skindb.types import Float32, Float64, Progress, float64, silent
 
-WIDTH = 100
-MERL = "Renderers that read MERL binaries"
-PROGRAMS = {
-    "Blender (4.2 or later)": (
-        "Import model.glb (File > Import > glTF 2.0), whose lengths are in metres; "
-        "its textures are connected. In "
-        "Cycles, it can be improved in three independent steps. Albedo: open "
-        "maps/albedo.exr as an image texture with "
-        "the colour space Linear Rec.709 and connect it to Base Color. Normals: "
-        "open maps/normal_tangent.exr with the "
-        "colour space Non-Color, multiply it by 0.5 and add 0.5 (Vector Math, "
-        "Multiply Add), and connect it to the "
-        "Color of the Normal Map node (Tangent Space). Light under the skin: set "
-        "Subsurface Weight to 1, the method "
-        "to Random Walk (Skin) and Subsurface Scale to 0.002, and connect "
-        "maps/translucency.exr with the colour space "
-        "Non-Color to Subsurface Radius. The scale contains 0.001 from mm to m and "
-        "a factor of 2, with which the "
-        "method spreads light as far as the dipole. usd/face.usda can be imported "
-        "too, but Blender reads only its "
-        "UsdPreviewSurface.",
-    ),
-    "Programs that read USD or MaterialX (Houdini, Omniverse, Arnold, Karma, ...)": (
-        "Load usd/face.usda. It contains the mesh in mm (metersPerUnit = 0.001), "
-        "an OpenPBR material with "
-        "light under the skin, and a UsdPreviewSurface for viewers without "
-        "MaterialX. usd/face.mtlx contains only the "
-        "material. subsurface_radius is the longest mean free path in mm, and "
-        "subsurface_radius_scale its ratio at "
-        "each texel and channel. With the random walk of OpenPBR, light travels as "
-        "far as by the dipole with the "
-        "measured sigma_tr. Keep the folder maps beside the folder usd, because "
-        "the mean free path is read from "
-        "maps/mean_free_path.exr. For several faces in one scene, reference the "
-        "files, and do not merge their layers.",
-    ),
-    "Mitsuba 3": (
-        "Run python mitsuba/skin.py picture.exr, which requires the packages "
-        "mitsuba and numpy, and for speed the "
-        "library LLVM, version 17 or later. The program contains a BSDF of the "
-        "exact measured BRDFs, mixed with the "
-        "weights maps/weight_<k>.exr. You can import it into your own scenes. It "
-        "does not include subsurface "
-        "transport.",
-    ),
-    "Unreal Engine 5 (not tested by us)": (
-        "Import model.glb (Interchange), which connects its textures. For light "
-        "under the skin, choose the shading "
-        "model Subsurface Profile. A profile has one mean free path for the whole "
-        "material: a typical value of "
-        "maps/mean_free_path.exr, divided by 10, because Unreal uses centimetres.",
-    ),
-    MERL: (
-        "bases/component_<k>.binary are the components of the surface BRDF in the "
-        "format of the MERL database. Mix "
-        "them with the weights maps/weight_<k>.exr and add the diffuse term, see "
-        "reflectance above.",
-    ),
-}
 PROVENANCE = (
     "schema_version",
     "software_version",
@@ -160,87 +99,6 @@ def _size(count: int) -> str:
     return f"{count / 1e6:.1f} MB" if count >= 100_000 else f"{count / 1e3:.1f} kB"
 
 
-def readme(manifest: Mapping[str, Any]) -> str:
-    """Text of the README for a manifest."""
-    parts = [
-        "skindb bundle",
-        "=============",
-        "",
-        *_paragraph(f"Written by {manifest['written_by']}. {_edited(manifest)}"),
-    ]
-    parts += ["", "Files", "-----", ""]
-    for name, file in manifest["files"].items():
-        parts += _item(
-            name, f"{file['holds']} [{file['units']}], {_size(file['bytes'])}"
-        )
-    parts += ["", "Units, frames and colours", "-------------------------", ""]
-    for name, text in manifest["conventions"].items():
-        parts += _item(name, text)
-    parts += ["", "Use in other programs", "---------------------", ""]
-    has_merl = any(name.endswith(".binary") for name in manifest["files"])
-    for name, (text,) in PROGRAMS.items():
-        if name != MERL or has_merl:
-            parts += [f"{name}:", *_paragraph(text), ""]
-    parts += ["Errors", "------", "", *_error_lines(manifest)]
-    return "\n".join(parts) + "\n"
-
-
-def _edited(manifest: Mapping[str, Any]) -> str:
-    edited = manifest["edited"]
-    if not edited:
-        return "The face is as measured."
-    by = ", ".join(f"{name} {amount:g}" for name, amount in edited["by"].items())
-    return f"The face was edited by {by}. {edited['consent']}"
-
-
-def _error_lines(manifest: Mapping[str, Any]) -> list[str]:
-    """Lines with the measured errors of the exports, and of the model itself."""
-    gltf = manifest["files"]["model.glb"]["approximation_error"]
-    usd = manifest["files"]["usd/face.usda"]
-    relative, perceptual = _rms_of(usd["approximation_error"])
-    preview, preview_perceptual = _rms_of(usd["approximation_error_of_preview"])
-    gltf_relative, gltf_perceptual = _rms_of(gltf)
-    items = {
-        "maps and bases": "the values of the model, in single or half precision; pictures "
-        "rendered from maps of the default size differ from those of the model by about 1%",
-        "model.glb": "pictures of its material differ from those of the model by "
-        f"{gltf_relative} (relative root mean square over lights and cameras in all "
-        "directions), and in cube-root space, which is closer to perception, by "
-        f"{gltf_perceptual}; normals differ by {gltf['normal_error_degrees']:.2f} degrees "
-        "(median)",
-        "mitsuba/skin.py": "pictures differ from those of skindb without subsurface "
-        "transport by about 1%, because of the size of texels",
-        "indices of refraction": "refractive_index of manifest.json is that of the skin. "
-        "ior in model.glb and specular_ior in usd only scale the fitted reflection at "
-        "normal incidence, so they may be far from it",
-        "usd/face.usda": f"the same errors are {relative} and {perceptual}, computed with "
-        "the equations of glTF and one index of refraction; implementations of OpenPBR "
-        f"differ in their layering. Those of its UsdPreviewSurface are {preview} and "
-        f"{preview_perceptual}",
-    }
-    for name, measure in manifest["error"].items():
-        if isinstance(measure, Mapping) and "median" in measure:
-            items[name] = (
-                f"{measure['meaning']}: median {measure['median']:.3g}, 95 % below "
-                f"{measure['quantile_95']:.3g} [{measure['units']}]"
-            )
-    return [line for name, text in items.items() for line in _item(name, text)]
-
-
-def _rms_of(error: Mapping[str, float]) -> tuple[str, str]:
-    """Relative RMS error of pictures, and that in cube-root space, as texts."""
-    relative, perceptual = (error[f"relative_rms{end}"] for end in ("", "_perceptual"))
-    return f"{relative:.1%}", f"{perceptual:.1%}"
-
-
-def _paragraph(text: str) -> list[str]:
-    return [fill(text, WIDTH)]
-
-
-def _item(name: str, text: str) -> list[str]:
-    return [fill(f"- {name}: {text}", WIDTH, subsequent_indent="  ")]
-
-
 def export_bundle(
     model: xr.DataTree,
     out: str | Path,
@@ -298,9 +156,10 @@ def export_bundle(
         manifest = _manifest(model, staged, described)
         text = json.dumps(plain(manifest), indent=1, allow_nan=False)
         private_file(staged / "manifest.json").write_text(text + "\n", encoding="utf-8")
-        private_file(staged / "README.txt").write_text(
-            readme(manifest), encoding="utf-8"
-        )
+        has_merl = any(name.endswith(".binary") for name in described)
+        template = ("skindb.export", "README.txt.jinja")
+        text = filled_template(*template, **manifest, has_merl=has_merl, size=_size)
+        private_file(staged / "README.txt").write_text(text, encoding="utf-8")
         if target.exists():
             target.rmdir()
         staged.rename(target)
@@ -531,28 +390,19 @@ def _sites(model: xr.DataTree) -> dict[str, Any]:
     """sigma_tr [mm^-1], its errors and its status per probe site and channel; empty
     without a probe.
     """
-    for group in (node.to_dataset() for node in model.subtree):
-        if variables.SITE_SIGMA_TR in group.data_vars:
-            sites = (
-                group["site"].values
-                if "site" in group.coords
-                else np.arange(group.sizes["site"])
-            )
-            have = {
-                key: group[name].values
-                for key, name in SITE_FIGURES.items()
-                if name in group.data_vars
-            }
-            if variables.SITE_STATUS in group.data_vars:
-                named = {int(status): status.name.lower() for status in ProbeStatus}
-                have["status"] = np.vectorize(named.__getitem__)(
-                    group[variables.SITE_STATUS].values
-                )
-            return {
-                str(site): {key: have[key][i] for key in have}
-                for i, site in enumerate(sites)
-            }
-    return {}
+    if "translucency" not in model.children:
+        return {}
+    group = model["translucency"].to_dataset()
+    have = {
+        key: group[name].values for key, name in SITE_FIGURES.items() if name in group
+    }
+    if variables.SITE_STATUS in group:
+        named = np.array([status.name.lower() for status in sorted(ProbeStatus)])
+        have["status"] = named[group[variables.SITE_STATUS].values]
+    return {
+        str(site): {key: values[i] for key, values in have.items()}
+        for i, site in enumerate(group["site"].values)
+    }
 
 
 def _fingerprint(path: Path) -> dict[str, Any]:
