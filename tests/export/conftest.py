@@ -119,7 +119,7 @@ def patch(tables: np.ndarray) -> xr.DataTree:
             },
             coords={"dictionary": ["a", "b"]},
         ),
-        "/probe": dataset(sites, coords={"site": ["cheek"]}),
+        "/translucency": dataset(sites, coords={"site": ["cheek"]}),
     }
     attrs = {
         "consent_scope": ["fit", "export"],
