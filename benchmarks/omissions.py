@@ -26,8 +26,6 @@ from skindb.render.rendering import chosen_camera
 from skindb.render.scene import Camera, Environment, from_model, lights_from_dome
 from skindb.render.shading import trace_view
 
-# factor on one light, so that all others together are below the wanted error
-DOMINANT = 1e5
 DIRECTIONS = 300  # of views around the face
 
 
@@ -57,22 +55,14 @@ def made(surface, camera, lighting, scene, quality, *, planned):
 
 def pictures(surface, camera, lights, scene) -> None:
     """Pictures with and without their plan."""
-    strong = lights.intensity.copy()
-    strong[0] *= DOMINANT
-    dominated = replace(lights, intensity=strong)
     complete = Lighting(lights)
     room = Lighting(None, sky())
     cases = {
         "one light": (Lighting(lights.select([0])), Quality(64)),
         "dome": (complete, Quality(64)),
         "dome, error 2 %": (complete, Quality(error=0.02)),
-        "one light dominates, error 2 %": (Lighting(dominated), Quality(error=0.02)),
         "sky": (room, Quality(64)),
         "dome, subsurface": (complete, Quality(32, subsurface=True)),
-        "one light dominates, subsurface, error 2 %": (
-            Lighting(dominated),
-            Quality(error=0.02, subsurface=True),
-        ),
     }
     for name, (lighting, quality) in cases.items():
         runs = [

@@ -17,7 +17,7 @@ from skindb.geometry.rays import RayScene
 from skindb.parameters import RenderParameters
 from skindb.render.image import auto_exposure, tone_map, write_exr, write_png
 from skindb.render.monte_carlo import Lighting, Quality, Rendering, render_monte_carlo
-from skindb.render.plan import KEPT, RenderPlan, plan_render, plan_scene
+from skindb.render.plan import KEPT, plan_scene
 from skindb.render.scene import (
     Camera,
     Environment,
@@ -30,12 +30,11 @@ from skindb.render.scene import (
 )
 from skindb.render.shading import (
     TERMS,
-    View,
     bounced_exitance,
-    glow_image,
+    escape_factor,
+    exitance_from_irradiance,
     require_translucency,
     shade_view,
-    total_exitance,
     trace_view,
     transmitted_irradiance,
     tree_opening,
@@ -53,28 +52,6 @@ NO_LIGHTS = Lights(
 DIRECTIONS = 512
 
 
-@dataclass(frozen=True)
-class Shot:
-    """The view of a camera, traced but not yet shaded, with its surface and lights."""
-
-    surface: Surface
-    lamps: Lights
-    scene: RayScene
-    view: View
-    plan: RenderPlan
-
-
-@dataclass(frozen=True)
-class Picture:
-    """Radiance that a camera sees, and what was skipped to compute it."""
-
-    # (h, w, 3) linear; empty if the picture is only planned
-    radiance: Float32
-    camera: str
-    lights: list[str]
-    skipped: list[str]
-
-
 def radiance_of(
     model: xr.DataTree,
     *,
@@ -83,9 +60,8 @@ def radiance_of(
     samples: int = 2,
     scale: float = 1.0,
     subsurface: bool = False,
-    explain: bool = False,
-) -> Picture:
-    """Render a model from a camera of its dome.
+) -> Float32:
+    """Radiance (h, w, 3) that a camera of the dome of a model sees, without noise.
 
     Parameters
     ----------
@@ -101,23 +77,38 @@ def radiance_of(
         Size of the picture relative to that of the camera.
     subsurface
         Whether diffuse light travels through the skin (dipole).
-    explain
-        Only plan the picture.
     """
     honour_consent(model.attrs, "export")
     dome = model["dome"].to_dataset().load()
     surface = from_model(model, fill=True)
     if subsurface:
         require_translucency(surface)
-    (lamps, light_names), (seen_by, camera_name) = (
-        chosen_lights(dome, lights),
-        chosen_camera(dome, camera),
+    seen_by = chosen_camera(dome, camera)[0].scaled(scale)
+    lamps = chosen_lights(dome, lights)[0]
+    return sum_over_lights(
+        surface, lamps, seen_by, samples=samples, subsurface=subsurface
     )
-    sized = seen_by if scale == 1 else seen_by.scaled(scale)
-    shot = trace_shot(surface, lamps, sized, samples=samples, subsurface=subsurface)
-    seen = np.empty((0, 0, 3), np.float32) if explain else picture(shot)
-    skipped = [str(omission) for omission in shot.plan.omissions]
-    return Picture(seen, camera_name, light_names, skipped)
+
+
+def sum_over_lights(
+    surface: Surface, lamps: Lights, camera: Camera, *, samples: int, subsurface: bool
+) -> Float32:
+    """Linear picture (h, w, 3) under all lights. Irradiances are summed before light travels
+    under the skin, as this is linear, and only visible surfels receive it.
+    """
+    scene = RayScene(surface.vertices, surface.faces)
+    view = trace_view(surface, camera, samples=samples, scene=scene)
+    terms = ("surface",) if subsurface else TERMS
+    direct = shade_view(view, surface, lamps, scene, terms=terms).sum(axis=0)
+    if subsurface:
+        received = transmitted_irradiance(surface, lamps, scene) @ lamps.intensity
+        shown = view.shown(len(surface.vertices))
+        glow = exitance_from_irradiance(surface, received, shown)
+        if surface.inter_reflection:
+            glow += bounced_exitance(surface, received)
+        escape = escape_factor(view, surface.eta)
+        direct += view.image(escape * view.interpolate(glow))
+    return np.asarray(direct, np.float32)
 
 
 def chosen_lights(dome: xr.Dataset, lights: Sequence[str]) -> tuple[Lights, list[str]]:
@@ -134,32 +125,6 @@ def chosen_camera(dome: xr.Dataset, camera: str | None) -> tuple[Camera, str]:
     names = [str(name) for name in dome["camera"].values]
     index = frontal_camera(dome) if camera is None else _index(names, camera, "camera")
     return cameras_from_dome(dome)[index], names[index]
-
-
-def trace_shot(
-    surface: Surface, lamps: Lights, camera: Camera, *, samples: int, subsurface: bool
-) -> Shot:
-    """Trace the rays of a camera and plan the shading."""
-    scene = RayScene(surface.vertices, surface.faces)
-    view = trace_view(surface, camera, samples=samples, scene=scene)
-    plan = plan_render(view.shown(len(surface.vertices)), subsurface=subsurface)
-    return Shot(surface, lamps, scene, view, plan)
-
-
-def picture(shot: Shot) -> Float32:
-    """Linear picture (h, w, 3), the sum over the lights."""
-    surface = shot.surface
-    lamps = shot.lamps
-    plan = shot.plan
-    terms = ("surface",) if plan.subsurface else TERMS
-    direct = shade_view(shot.view, surface, lamps, shot.scene, terms=terms).sum(axis=0)
-    if plan.subsurface:
-        glow = total_exitance(surface, lamps, shot.scene, receivers=plan.surfels)
-        if surface.inter_reflection:
-            received = transmitted_irradiance(surface, lamps, shot.scene)
-            glow += bounced_exitance(surface, received @ lamps.intensity)
-        direct += glow_image(shot.view, surface, glow)
-    return np.asarray(direct, np.float32)
 
 
 def frontal_camera(dome: xr.Dataset) -> int:
@@ -272,7 +237,6 @@ def render(
         scale=scale,
         spacing=spacing,
         error=error,
-        terms=tuple(terms),
     )
     quality = Quality(samples, error, subsurface, tuple(terms), tree_opening(error)[0])
     rendering = render_monte_carlo(
@@ -319,7 +283,6 @@ def render_inputs(
     scale: float,
     spacing: float | None = None,
     error: float | None = None,
-    terms: tuple[str, ...] = ("diffuse", "surface"),
 ) -> RenderInputs:
     """Surface, camera and lights of a picture, without the parts that it does not need
     for this relative error.
@@ -334,14 +297,14 @@ def render_inputs(
     surface = from_model(model, fill=True)
     if subsurface:
         require_translucency(surface)
-    sized = seen_by if scale == 1 else seen_by.scaled(scale)
+    sized = seen_by.scaled(scale)
     scene = RayScene(surface.vertices, surface.faces)
     if subsurface and spacing is not None:
         visible = trace_view(surface, sized, scene=scene).shown(len(surface.vertices))
         surface = subdivide_surface(surface, spacing, visible)
         scene = RayScene(surface.vertices, surface.faces)
     plan = plan_scene(
-        surface, sized, lighting, scene, subsurface=subsurface, error=error, terms=terms
+        surface, sized, lighting, scene, subsurface=subsurface, error=error
     )
     return RenderInputs(
         plan.surface,

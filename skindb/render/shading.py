@@ -137,23 +137,6 @@ def exitances(
     return out
 
 
-def total_exitance(
-    surface: Surface,
-    lights: Lights,
-    scene: RayScene,
-    *,
-    receivers: Mask | None = None,
-) -> Float32:
-    """Sum (v, 3) of `exitances` over the lights; as it is linear, irradiances are
-    summed before the traversal.
-    """
-    return exitance_from_irradiance(
-        surface,
-        transmitted_irradiance(surface, lights, scene) @ lights.intensity,
-        receivers,
-    )
-
-
 def bounced_exitance(surface: Surface, received: Array) -> Array:
     """Radiant exitance (v, 3) under the boundary, R_d E', by light E' that other parts of the
     surface reflect with one diffuse bounce.
@@ -479,11 +462,6 @@ def polariser_factor(
     towards = unit(towards)
     cosine = lengths(towards + view.towards) / 2  # of theta_d
     return view.image(1 - polarisation * circular_reversal(cosine, eta)[:, None])
-
-
-def glow_image(view: View, surface: Surface, glow: Image) -> Image:
-    """Image (h, w, 3) of radiant exitance (v, 3) under the boundary."""
-    return view.image(escape_factor(view, surface.eta) * view.interpolate(glow))
 
 
 def _facet_cosine(surface: Surface, corners: Index, towards: Array) -> Array:

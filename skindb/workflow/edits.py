@@ -134,7 +134,7 @@ def edit_grid(
     report = progress or silent
     require_consent({**source.model.attrs, "take": take}, "export")
     options.setdefault("scale", _grid_scale(source.model))
-    plain = radiance_of(source.model, **options).radiance
+    plain = radiance_of(source.model, **options)
     pictures = {}
     strongest = {}
     number = 0
@@ -146,7 +146,7 @@ def edit_grid(
             strongest[label] = source.move(
                 {name: strength * amount for name, amount in amounts.items()}
             )
-            pictures[label].append(radiance_of(strongest[label], **options).radiance)
+            pictures[label].append(radiance_of(strongest[label], **options))
             number += 1
             report("edits", number, steps)
     titles = [take, *(f"{strength:g} times the trait" for strength in strengths)]
@@ -209,7 +209,7 @@ def basis_grid(
     pictures = {}
     for name, mixture in mixtures.items():
         reduced_model = with_basis(model, mixture=mixture, names=names, tables=tables)
-        pictures[name] = radiance_of(reduced_model, **options).radiance
+        pictures[name] = radiance_of(reduced_model, **options)
     write_grid(out, {take: list(pictures.values())}, list(pictures))
     *_, full = pictures.values()
     return {

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +16,9 @@ from skindb.render.monte_carlo import Lighting
 from skindb.render.photographs import compare_photographs
 from skindb.render.rendering import (
     fixed_exposure,
-    picture,
     render,
     render_picture,
-    trace_shot,
+    sum_over_lights,
 )
 from skindb.render.scene import cameras_from_dome, from_model, lights_from_dome
 from skindb.render.shading import render_view
@@ -117,8 +115,8 @@ def test_picture__is_the_sum_over_the_lights(
     dome = model["dome"].to_dataset()
     camera = cameras_from_dome(dome)[0].scaled(2.0)
     lights = lights_from_dome(dome).select([0, 2])
-    together = picture(
-        trace_shot(surface, lights, camera, samples=2, subsurface=subsurface)
+    together = sum_over_lights(
+        surface, lights, camera, samples=2, subsurface=subsurface
     )
     each = render_view(surface, camera, lights, samples=2, subsurface=subsurface)
     assert each.max(axis=(1, 2, 3)).min() > 0
@@ -130,18 +128,15 @@ def test_picture__is_the_sum_over_the_lights(
 def test_render_picture__plan_leaves_the_picture_the_same(
     model: xr.DataTree, tmp_path: Path, subsurface: bool
 ) -> None:
-    dome = model["dome"].to_dataset()
-    shot = trace_shot(
-        from_model(model),
-        lights_from_dome(dome),
-        cameras_from_dome(dome)[0],
-        samples=1,
-        subsurface=subsurface,
-    )
-    seen = int(shot.plan.surfels.sum())
+    surface = from_model(model)
+    camera = cameras_from_dome(model["dome"].to_dataset())[0]
+    visible = shading.trace_view(surface, camera).shown(256)
+    seen = int(visible.sum())
     assert 50 < seen < 200  # of 256: the square is larger than the picture
-    everything = replace(shot, plan=replace(shot.plan, surfels=np.ones(256, bool)))
-    np.testing.assert_array_equal(picture(shot), picture(everything))  # the bound is 0
+    light = np.ones((256, 3))
+    everywhere = shading.exitance_from_irradiance(surface, light)
+    at_visible = shading.exitance_from_irradiance(surface, light, visible)
+    np.testing.assert_array_equal(everywhere[visible], at_visible[visible])
     told = render_picture(
         model, tmp_path / "a.exr", samples=8, subsurface=subsurface, explain=True
     )
@@ -176,14 +171,12 @@ def test_picture__all_lights_are_carried_as_three_columns(
     model["dome"] = model["dome"].to_dataset().isel(light=[0, 1, 2, 0, 1])
     surface = from_model(model)
     dome = model["dome"].to_dataset()
-    picture(
-        trace_shot(
-            surface,
-            lights_from_dome(dome),
-            cameras_from_dome(dome)[0],
-            samples=1,
-            subsurface=True,
-        )
+    sum_over_lights(
+        surface,
+        lights_from_dome(dome),
+        cameras_from_dome(dome)[0],
+        samples=1,
+        subsurface=True,
     )
     assert columns == [3]
 

@@ -10,9 +10,9 @@ import pytest
 from skindb.geometry.rays import RayScene
 from skindb.optics.diffusion import dipole_s
 from skindb.render.monte_carlo import Lighting, Quality, render_monte_carlo
-from skindb.render.plan import covered_pixels, notable_lights, plan_scene
+from skindb.render.plan import covered_pixels, plan_scene
 from skindb.render.scene import Camera, Lights, Surface, from_model
-from skindb.render.shading import render_view, trace_view
+from skindb.render.shading import trace_view
 from tests.render.test_monte_carlo import ball, camera
 from tests.small_face import small_face
 
@@ -44,114 +44,6 @@ def around(power: np.ndarray, seed: int = 3, radius: float = 5.0) -> Lights:
         size,
         -place / 500,
         np.zeros(len(power)),
-    )
-
-
-def whole(surface: Surface, lights: Lights, **options) -> np.ndarray:
-    return render_view(
-        surface, front(), lights, samples=2, disc_samples=4, **options
-    ).sum(axis=0)
-
-
-def apart(found: np.ndarray, true: np.ndarray) -> float:
-    """RMS difference over RMS."""
-    return float(np.sqrt(np.mean((found - true) ** 2) / np.mean(true**2)))
-
-
-def planned(surface: Surface, lights: Lights, error: float, **options):
-    """The lights that are kept, and the omission or None."""
-    scene = RayScene(surface.vertices, surface.faces)
-    view = trace_view(surface, front(), scene=scene)
-    kept, omissions = notable_lights(
-        lights, surface, view, scene, error=error, **options
-    )
-    return kept, omissions[0] if omissions else None
-
-
-POWERS = {
-    "one dominates": np.append(np.full(20, 1.0), 1e5),
-    "eight decades": 10.0 ** np.random.default_rng(1).uniform(-3, 5, 24),
-    "half are faint": np.repeat([1.0, 1e4], 10),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", list(POWERS))
-@pytest.mark.parametrize("subsurface", [False, True])
-def test_notable_lights__pictures_agree_within_the_bound(
-    name: str, subsurface: bool
-) -> None:
-    surface = skin()
-    lights = around(POWERS[name])
-    true = whole(surface, lights, subsurface=subsurface)
-    for error in (0.5, 0.05, 0.005):
-        kept, omission = planned(surface, lights, error, indirect=subsurface)
-        assert omission is not None
-        assert omission.skipped == len(lights) - len(kept) > 0
-        assert 0 < omission.bound <= 0.1 * error
-        assert (
-            0
-            < apart(whole(surface, kept, subsurface=subsurface), true)
-            <= omission.bound
-        )
-
-
-def test_notable_lights__one_dominating_light_is_enough() -> None:
-    kept, omission = planned(skin(), around(POWERS["one dominates"]), 0.05)
-    assert len(kept) == 1
-    assert kept.intensity.max() == 1e5
-    assert (
-        "lights: 20 of 21 are skipped (together they contribute less than 0.1 of the wanted error)"
-        in str(omission)
-    )
-
-
-@pytest.mark.parametrize("error", [0.05, 0.01])
-@pytest.mark.parametrize("subsurface", [False, True])
-def test_notable_lights__equal_lights_are_all_kept(
-    error: float, subsurface: bool
-) -> None:
-    lights = around(np.ones(24))
-    kept, omission = planned(skin(), lights, error, indirect=subsurface)
-    assert kept is lights
-    assert omission is None
-
-
-def test_plan_scene__bounds_are_relative_to_the_terms_of_the_picture() -> None:
-    surface = skin()
-    lights = around(POWERS["eight decades"])
-    parts = {
-        ("diffuse",): replace(surface, parameters=0 * surface.parameters),
-        ("surface",): replace(surface, diffuse=0 * surface.diffuse),
-        ("diffuse", "surface"): surface,
-    }
-    bounds = {}
-    for terms, part in parts.items():
-        plan = plan_scene(
-            surface,
-            front(),
-            Lighting(lights),
-            RayScene(surface.vertices, surface.faces),
-            error=0.05,
-            terms=terms,
-        )
-        (omission,) = [one for one in plan.omissions if one.what == "lights"]
-        bounds[terms] = omission.bound
-        assert omission.bound == pytest.approx(planned(part, lights, 0.05)[1].bound)
-        assert plan.surface is surface
-    assert len(set(bounds.values())) == 3
-
-
-def test_notable_lights__in_the_dark_nothing_is_skipped() -> None:
-    lights = around(np.ones(3))
-    behind = replace(lights, position=lights.position * [1, 1, -1])
-    assert (
-        planned(skin(), replace(lights, intensity=0 * lights.intensity), 0.1)[1] is None
-    )
-    kept, omission = planned(skin(), behind, 0.1)
-    assert (
-        omission is None
-        or apart(whole(skin(), kept), whole(skin(), behind)) <= omission.bound
     )
 
 

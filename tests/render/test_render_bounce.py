@@ -19,7 +19,7 @@ from skindb.optics.diffusion import dipole_s
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.render.monte_carlo import Lighting, Quality, render_monte_carlo
 from skindb.render.photographs import compare_photographs
-from skindb.render.rendering import picture, trace_shot
+from skindb.render.rendering import sum_over_lights
 from skindb.render.scene import (
     Camera,
     Lights,
@@ -97,8 +97,7 @@ def _monte_carlo(surface: Surface) -> np.ndarray:
 
 
 def _under_the_skin(surface: Surface) -> np.ndarray:
-    shot = trace_shot(surface, _lamp(), _view(), samples=1, subsurface=True)
-    return picture(shot)
+    return sum_over_lights(surface, _lamp(), _view(), samples=1, subsurface=True)
 
 
 @pytest.mark.parametrize("drawn", [_shaded, _monte_carlo, _under_the_skin])
