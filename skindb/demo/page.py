@@ -1,24 +1,16 @@
-"""A self-contained HTML page with tables, which can be downloaded as CSV files, pictures of all
-subjects at one exposure and one scale, and plots for light and dark pages.
-"""
+"""Pictures of all subjects at one exposure and one scale, and plots for light and dark pages."""
 
 from __future__ import annotations
 
-import base64
-import html
-import importlib.resources
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import imagecodecs
 import numpy as np
 import xarray as xr
 
 from skindb import plots
-from skindb.analysis import plot_albedo, plot_basis_size, plot_translucency
-from skindb.files import csv_text
 from skindb.geometry.rays import RayScene
 from skindb.render.image import auto_exposure, encode_srgb, tone_map
 from skindb.render.photographs import Comparison, side_by_side
@@ -53,133 +45,6 @@ SIZE = (4.4, 3.3)  # inches; text is still readable at 360 px, the width of a ph
 DOTS = 160  # per inch, twice the resolution of a page of 360 px
 INK = "#8a847c"  # of text and lines, readable on light and on dark pages
 MAX_NORMAL_ANGLE = 15  # degrees, end of the axis
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table of the report; its name is that of the file that a reader downloads."""
-
-    name: str
-    header: Sequence[str]
-    rows: Sequence[Sequence[Any]]
-
-    def columns(self, names: Sequence[str]) -> Table:
-        """The table with only these columns."""
-        indices = [list(self.header).index(name) for name in names]
-        return Table(
-            self.name, list(names), [[row[i] for i in indices] for row in self.rows]
-        )
-
-    def renamed(self, header: Sequence[str]) -> Table:
-        """The table with another header."""
-        return Table(self.name, header, self.rows)
-
-
-def picture(image: Bytes, alt: str, *, caption: str = "") -> str:
-    """An sRGB picture (rows, cols, 3) with an alternative text and, if there is one, a
-    visible caption.
-    """
-    image_tag = (
-        f'<img alt="{html.escape(alt)}" '
-        f'src="{_png(imagecodecs.png_encode(np.ascontiguousarray(image)))}">'
-    )
-    text = f"<figcaption>{html.escape(caption)}</figcaption>" if caption else ""
-    return f"<figure>{image_tag}{text}</figure>"
-
-
-def row(pictures: Iterable[str], *, kind: str = "row") -> str:
-    """Pictures side by side; `kind` is a class of the style sheet: "row", "wide" or "plots"."""
-    return f'<div class="{kind}">{"".join(pictures)}</div>'
-
-
-def _png(data: bytes | bytearray) -> str:
-    return f"data:image/png;base64,{base64.b64encode(data).decode()}"
-
-
-def table(content: Table) -> str:
-    """A table; numbers are printed to three significant digits."""
-    head = "".join(
-        f'<th scope="col">{html.escape(name)}</th>' for name in content.header
-    )
-    body = "".join(
-        "<tr>" + "".join(map(_entry, values)) + "</tr>" for values in content.rows
-    )
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-
-
-def _entry(value: Any) -> str:
-    kind = "" if isinstance(value, str) else ' class="number"'
-    return f"<td{kind}>{html.escape(cell(value))}</td>"
-
-
-def cell(value: Any) -> str:
-    """The text of a value: floats with three significant digits, NaN as a dash, counts
-    with commas.
-    """
-    if isinstance(value, (int, np.integer)) and not isinstance(value, bool):
-        return f"{value:,}"
-    if not isinstance(value, (float, np.floating)):
-        return str(value)
-    number = float(value)
-    return (
-        "-"
-        if np.isnan(number)
-        else f"{number:.3g}"
-        if abs(number) < 1000
-        else f"{number:,.0f}"
-    )
-
-
-def downloads(tables: Iterable[Table]) -> str:
-    """Links for downloading tables as CSV files with all columns and digits; the page
-    contains the files.
-    """
-    links = []
-    for content in tables:
-        data = base64.b64encode(
-            csv_text(content.header, content.rows).encode()
-        ).decode()
-        name = html.escape(f"{content.name}.csv")
-        links.append(
-            f'<a download="{name}" href="data:text/csv;charset=utf-8;base64,{data}">{name}</a>'
-        )
-    return f'<p class="downloads">Download: {", ".join(links)}</p>'
-
-
-def details(summary: str, blocks: Iterable[str]) -> str:
-    """Blocks that are hidden until the reader opens them."""
-    return (
-        f"<details><summary>{html.escape(summary)}</summary>{''.join(blocks)}</details>"
-    )
-
-
-def paragraph(text: str) -> str:
-    """A paragraph of plain text."""
-    return f"<p>{html.escape(text)}</p>"
-
-
-def page(title: str, lead: str, sections: Iterable[tuple[str, Sequence[str]]]) -> str:
-    """The page: title, lead, and sections of (heading, parts of HTML)."""
-    parts = list(sections)
-    links = "".join(
-        f'<a href="#s{i}">{html.escape(name)}</a>' for i, (name, _) in enumerate(parts)
-    )
-    body = "".join(
-        f'<section><h2 id="s{i}">{html.escape(name)}</h2>{"".join(blocks)}</section>'
-        for i, (name, blocks) in enumerate(parts)
-    )
-    style = (
-        importlib.resources.files("skindb.demo")
-        .joinpath("report.css")
-        .read_text(encoding="utf-8")
-    )
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        '<meta name="color-scheme" content="light dark">'
-        f"<title>{html.escape(title)}</title><style>{style}</style></head><body><main><h1>{html.escape(title)}</h1>"
-        f'<p class="lead">{html.escape(lead)}</p><nav>{links}</nav>{body}</main></body></html>\n'
-    )
 
 
 @dataclass(frozen=True)
@@ -312,8 +177,8 @@ def _byte(image: Image) -> Picture:
     return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
-def _plot(ax: Axes, alt: str) -> str:
-    """A plot with its legend below and without a background; the figure is closed."""
+def plot_png(ax: Axes) -> bytes:
+    """A plot as PNG with its legend below and without a background; the figure is closed."""
     from matplotlib import pyplot
 
     handles, _ = ax.get_legend_handles_labels()
@@ -332,12 +197,11 @@ def _plot(ax: Axes, alt: str) -> str:
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=DOTS, bbox_inches="tight", transparent=True)
     pyplot.close(figure)
-    return (
-        f'<img class="plot" alt="{html.escape(alt)}" src="{_png(buffer.getvalue())}">'
-    )
+    return buffer.getvalue()
 
 
-def _axes() -> Axes:
+def axes() -> Axes:
+    """Axes of a plot for the page."""
     from matplotlib import pyplot, rc_context
 
     names = ("axes.edgecolor", "axes.labelcolor", "text.color")
@@ -346,11 +210,11 @@ def _axes() -> Axes:
     return ax
 
 
-def reflectance_plot(recovered: Mapping[str, Recovery]) -> str:
+def reflectance_plot(recovered: Mapping[str, Recovery]) -> bytes:
     """Plot of recovered against true diffuse reflectance, for every fortieth fitted
     surfel of all takes.
     """
-    ax = _axes()
+    ax = axes()
     for channel, (name, colour) in enumerate(zip("RGB", plots.CHANNELS, strict=True)):
         true = []
         recovered_values = []
@@ -374,14 +238,12 @@ def reflectance_plot(recovered: Mapping[str, Recovery]) -> str:
     ax.plot([0, top], [0, top], color=INK, lw=0.7, label="equal")
     ax.set_xlabel("true diffuse reflectance R_d [1]")
     ax.set_ylabel("recovered R_d [1]")
-    return _plot(
-        ax, "Recovered against true diffuse reflectance, with the line of equality."
-    )
+    return plot_png(ax)
 
 
-def normal_plot(recovered: Mapping[str, Recovery]) -> str:
+def normal_plot(recovered: Mapping[str, Recovery]) -> bytes:
     """Plot of the cumulative distribution of the error of normals, one line for each take."""
-    ax = _axes()
+    ax = axes()
     ax.set_prop_cycle(color=plots.CYCLE)
     for i, (take, recovery) in enumerate(recovered.items()):
         angle = recovery.normal_angle[recovery.fitted]
@@ -391,28 +253,4 @@ def normal_plot(recovered: Mapping[str, Recovery]) -> str:
     ax.set_xlim(0, MAX_NORMAL_ANGLE)
     ax.set_xlabel("angle between recovered and true normal [deg]")
     ax.set_ylabel("fitted surfels below [%]")
-    return _plot(
-        ax,
-        "Cumulative distribution of the angle between the recovered and the true normal, by take.",
-    )
-
-
-def translucency_plot(table: xr.Dataset) -> str:
-    """Plot of mean sigma_tr by site and channel."""
-    alt = "Mean sigma_tr with its 95 % interval, by site and channel."
-    return _plot(plot_translucency(table, ax=_axes()), alt)
-
-
-def basis_size_plot(curve: xr.Dataset) -> str:
-    """Plot of the error against the number of basis BRDFs."""
-    alt = (
-        "Relative error of the reflectance against the number of basis BRDFs, with its "
-        "95 % interval."
-    )
-    return _plot(plot_basis_size(curve, ax=_axes()), alt)
-
-
-def albedo_plot(histograms: xr.Dataset) -> str:
-    """Plot of histograms of the first decorrelated axis of the albedo."""
-    alt = "Histograms of the albedo along its first decorrelated axis, one line for each take."
-    return _plot(plot_albedo(histograms, ax=_axes()), alt)
+    return plot_png(ax)

@@ -4,30 +4,35 @@ populations, an edit and its distance from the data.
 
 from __future__ import annotations
 
-import html
+import base64
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import imagecodecs
 import numpy as np
 import xarray as xr
+from pandas import DataFrame
 
 from skindb import __version__
+from skindb.analysis import plot_albedo, plot_basis_size, plot_translucency
 from skindb.analysis.studies import tabulate_study
-from skindb.demo import page
 from skindb.demo.page import (
-    Image,
+    Picture,
     Portraits,
-    Table,
+    axes,
     draw_portraits,
     map_pictures,
+    normal_plot,
+    plot_png,
     portrait,
     predictions,
+    reflectance_plot,
 )
-from skindb.files import private_file
+from skindb.files import csv_text, filled_template, private_file
 from skindb.render.photographs import Comparison, compare_images
 from skindb.schema import FitStatus, variables
 from skindb.types import Progress
@@ -35,31 +40,12 @@ from skindb.virtual.capture import Recovery
 
 PER_TAKE = ("models", "fits", "recovered", "compared")
 ERROR_COLUMNS = ("relative_rmse", "psnr", "ssim", "delta_e_median")
-SUBJECT_HEADER = (
-    "take",
-    "age",
-    "gender",
-    "ancestry",
-    "condition",
-    "surfels",
-    "fitted_surfels",
-    "fitted_percent",
-    "normal_median_deg",
-    "normal_95_deg",
-    "diffuse_red_percent",
-    "diffuse_green_percent",
-    "diffuse_blue_percent",
-    "held_out_percent",
-)
+CHANNELS = ("red_percent", "green_percent", "blue_percent")
 # largest distance of an edit inside the data, in median distances between takes
 INSIDE = 1.0
-MEASURED = "measured"
-SHOWN = ("trait", "takes_with", "takes_without", "brdf_shift", "colour_shift")
+SHOWN = ["trait", "takes_with", "takes_without", "brdf_shift", "colour_shift"]
 VIEWER = "viewer.html"  # beside the report
-ERROR_NAMES = ("Normal [deg]", "R_d [%]", "Held-out lights [%]")
 LEAST_PERCENT = 0.1  # smallest percentage that is written as a number
-Record = Mapping[str, Any]
-Section = Callable[["Results", Portraits], list[str]]
 
 
 @dataclass
@@ -109,181 +95,287 @@ def status_counts(model: xr.DataTree) -> dict[FitStatus, int]:
     return {status: int(counts[status]) for status in FitStatus}
 
 
-def subject_table(results: Results) -> Table:
+def subject_table(results: Results) -> DataFrame:
     """One row per take: attributes, number of fitted surfels, and median errors against
     the truth.
     """
     rows = []
     for take, model in results.models.items():
         counts = status_counts(model)
-        traits = dict(model.attrs.get("traits", {}))
         total = sum(counts.values())
-        attributes = [traits.get(name, "") for name in ("age", "gender", "ancestry")]
-        fitted = [
-            total,
-            counts[FitStatus.FITTED],
-            100 * counts[FitStatus.FITTED] / total,
-        ]
-        errors_of_take: Any = results.recovered[take].summary()
-        errors = [
-            errors_of_take["normal_median_deg"],
-            errors_of_take["normal_95_deg"],
-            *errors_of_take["diffuse_median_percent"],
-        ]
-        held = 100 * results.fits[take].get(variables.HELD_OUT_ERROR, {}).get(
-            "median", float("nan")
-        )
+        traits = model.attrs.get("traits", {})
+        errors: Any = results.recovered[take].summary()
+        held_out = results.fits[take].get(variables.HELD_OUT_ERROR, {})
+        diffuse = errors["diffuse_median_percent"]
         rows.append(
-            [
-                take,
-                *attributes,
-                model.attrs.get("condition", "normal"),
-                *fitted,
-                *errors,
-                held,
-            ]
+            {
+                "take": take,
+                **{
+                    name: traits.get(name, "") for name in ("age", "gender", "ancestry")
+                },
+                "condition": model.attrs.get("condition", "normal"),
+                "surfels": total,
+                "fitted_surfels": counts[FitStatus.FITTED],
+                "fitted_percent": 100 * counts[FitStatus.FITTED] / total,
+                "normal_median_deg": errors["normal_median_deg"],
+                "normal_95_deg": errors["normal_95_deg"],
+                **{f"diffuse_{c}": x for c, x in zip(CHANNELS, diffuse, strict=True)},
+                "held_out_percent": 100 * held_out.get("median", float("nan")),
+            }
         )
-    return Table("subjects", SUBJECT_HEADER, rows)
+    return DataFrame(rows)
 
 
-def status_table(results: Results) -> Table:
+def status_table(results: Results) -> DataFrame:
     """Number of surfels by take and status."""
-    counted = {take: status_counts(model) for take, model in results.models.items()}
-    rows = [
-        [
-            take,
-            status.name.lower(),
-            count,
-            100 * count / sum(counts.values()),
-            status.explanation,
-        ]
-        for take, counts in counted.items()
-        for status, count in counts.items()
-    ]
-    return Table(
-        "surfel_statuses", ["take", "status", "surfels", "percent", "explanation"], rows
+    rows = []
+    for take, model in results.models.items():
+        counts = status_counts(model)
+        for status, count in counts.items():
+            name = status.name.lower()
+            percent = 100 * count / sum(counts.values())
+            rows.append((take, name, count, percent, status.explanation))
+    return DataFrame(
+        rows, columns=["take", "status", "surfels", "percent", "explanation"]
     )
 
 
-def status_sums(results: Results) -> Table:
+def status_sums(statuses: DataFrame) -> DataFrame:
     """Number of surfels of all takes by status, for statuses that occur."""
-    counted = [status_counts(model) for model in results.models.values()]
-    sums = {status: sum(counts[status] for counts in counted) for status in FitStatus}
-    total = sum(sums.values())
-    rows = [
-        [
-            status.name.lower().replace("_", " "),
-            status.explanation,
-            count,
-            100 * count / total,
-        ]
-        for status, count in sums.items()
-        if count
-    ]
-    return Table("surfel_statuses", ["status", "meaning", "surfels", "%"], rows)
+    keys = ["status", "explanation"]
+    sums = statuses.groupby(keys, sort=False, as_index=False)["surfels"].sum()
+    sums = sums[sums["surfels"] > 0]
+    return DataFrame(
+        {
+            "status": sums["status"].str.replace("_", " "),
+            "meaning": sums["explanation"],
+            "surfels": sums["surfels"],
+            "%": 100 * sums["surfels"] / sums["surfels"].sum(),
+        }
+    )
 
 
-def photograph_table(results: Results) -> Table:
+def photograph_table(results: Results) -> DataFrame:
     """Errors of the predicted photographs."""
     rows = [
-        [
-            take,
-            comparison.light,
-            comparison.camera,
-            "yes" if comparison.held_out else "no",
-            *(comparison.error[name] for name in ERROR_COLUMNS),
-        ]
+        {
+            "take": take,
+            "light": comparison.light,
+            "camera": comparison.camera,
+            "held_out": "yes" if comparison.held_out else "no",
+            **{name: comparison.error[name] for name in ERROR_COLUMNS},
+        }
         for take, comparisons in results.compared.items()
         for comparison in comparisons
     ]
-    return Table(
-        "photographs", ["take", "light", "camera", "held_out", *ERROR_COLUMNS], rows
-    )
+    return DataFrame(rows)
 
 
-def site_table(results: Results) -> Table:
+def site_table(results: Results) -> DataFrame:
     """Relative error of sigma_tr [%] at each probe site."""
     rows = []
     for take, recovery in results.recovered.items():
         summary: Any = recovery.summary()
-        rows += [
-            [take, site, *map(float, values)]
-            for site, values in summary["sigma_tr_percent"].items()
-        ]
-    header = ["take", "site", "red_percent", "green_percent", "blue_percent"]
-    return Table("sigma_tr_errors", header, rows)
+        for site, errors in summary["sigma_tr_percent"].items():
+            rows.append((take, site, *map(float, errors)))
+    return DataFrame(rows, columns=["take", "site", *CHANNELS])
 
 
-def study_table(name: str, study: xr.DataTree) -> Table:
+def study_table(study: xr.DataTree) -> DataFrame:
     """Table of a population study."""
-    return Table(name, *tabulate_study(study))
+    header, rows = tabulate_study(study)
+    return DataFrame(rows, columns=list(header), dtype=object)
 
 
-def time_tables(results: Results) -> tuple[Table, Table]:
-    """Wall time [s] of the stages of the demo, and of the stages of a fit as mean over takes."""
-    stages: dict[str, list[float]] = {}
-    for fit in results.fits.values():
-        for name, seconds in fit["seconds"].items():
-            stages.setdefault(name, []).append(seconds)
-    demo = [
-        [name, seconds] for name, seconds in results.seconds.items() if name != "report"
+def cell(value: Any) -> str:
+    """The text of a value: floats with three significant digits, NaN as a dash, counts
+    with commas.
+    """
+    if isinstance(value, (int, np.integer)) and not isinstance(value, bool):
+        return f"{value:,}"
+    if not isinstance(value, (float, np.floating)):
+        return str(value)
+    if np.isnan(value):
+        return "-"
+    return f"{value:.3g}" if -1000 < value < 1000 else f"{value:,.0f}"
+
+
+def rows_of(frame: DataFrame) -> list[list[Any]]:
+    """Rows of a table."""
+    rows: list[list[Any]] = frame.to_dict("split")["data"]
+    return rows
+
+
+def csv_of(frame: DataFrame) -> bytes:
+    """A table as CSV with all digits."""
+    return csv_text([*frame], rows_of(frame)).encode()
+
+
+def data_url(kind: str, data: bytes | bytearray) -> str:
+    """Data as an address that contains them."""
+    return f"data:{kind};base64,{base64.b64encode(data).decode()}"
+
+
+def image_url(image: Picture) -> str:
+    """An sRGB picture (rows, cols, 3) as an address that contains it."""
+    return data_url("image/png", imagecodecs.png_encode(np.ascontiguousarray(image)))
+
+
+def write_report(path: Path, results: Results, *, progress: Progress) -> Path:
+    """Write the report, which is viewed without a network, and return its path."""
+    portraits = draw_portraits(results.models)
+    content: dict[str, Any] = {
+        "version": __version__,
+        "viewer": VIEWER,
+        "minutes": (time.monotonic() - results.began) / 60,
+    }
+    sections = (_subjects, _photographs, _recovered, _population, _edit, _times)
+    for i, section in enumerate(sections):
+        progress("report", i, len(sections))
+        content |= section(results, portraits)
+    functions = (cell, rows_of, csv_of, data_url, image_url)
+    content |= {function.__name__: function for function in functions}
+    page = filled_template("skindb.demo", "report.html.jinja", **content)
+    private_file(path).write_text(page, encoding="utf-8")
+    progress("report", len(sections), len(sections))
+    return path
+
+
+def _subjects(results: Results, portraits: Portraits) -> dict[str, Any]:
+    subjects = subject_table(results)
+    statuses = status_table(results)
+    drawn = portraits.cut(portraits.images)
+    maps = map_pictures(results.models)
+    shown = {
+        take: min(compared, key=lambda comparison: not comparison.held_out)
+        for take, compared in results.compared.items()
+        if compared
+    }
+    exposure = min((c.error["exposure"] for c in shown.values()), default=1.0)
+    strips = dict(zip(shown, predictions([*shown.values()], exposure), strict=True))
+    takes = []
+    for record in subjects.to_dict("records"):
+        take = record["take"]
+        who = [record[name] for name in ("age", "gender", "ancestry", "condition")]
+        takes.append(
+            {
+                **record,
+                "who": ", ".join(str(x) for x in who if x != "").replace("_", " "),
+                "not_fitted": _reasons(statuses[statuses["take"] == take]),
+                "portrait": drawn[take],
+                "maps": maps[take],
+                "prediction": shown.get(take),
+                "strip": strips.get(take),
+            }
+        )
+    return {
+        "takes": takes,
+        "subjects": subjects,
+        "statuses": statuses,
+        "status_sums": status_sums(statuses),
+    }
+
+
+def _reasons(statuses: DataFrame) -> str:
+    """Statuses of surfels of one take without a fit, the most frequent first."""
+    chosen = (statuses["surfels"] > 0) & (statuses["status"] != "fitted")
+    texts = []
+    for _, row in statuses[chosen].sort_values("surfels", ascending=False).iterrows():
+        percent = f"below {LEAST_PERCENT}"
+        if row["percent"] >= LEAST_PERCENT:
+            percent = f"{row['percent']:.1f}"
+        texts.append(f"{row['status'].replace('_', ' ')} {percent} %")
+    return ", ".join(texts) or "none"
+
+
+def _photographs(results: Results, _: Portraits) -> dict[str, Any]:
+    photographs = photograph_table(results)
+    held = photographs[photographs["held_out"] == "yes"]
+    names = ["relative_rmse", "delta_e_median"]
+    shown = photographs[["take", "light", "held_out", *names]]
+    header = ["take", "light", "held out", "relative RMSE", "delta E"]
+    medians = {"count": len(held), **held[names].median()}
+    return {
+        "photographs": photographs,
+        "photograph_errors": shown.set_axis(header, axis=1),
+        "held_out": medians if len(held) else None,
+    }
+
+
+def _recovered(results: Results, _: Portraits) -> dict[str, Any]:
+    recovered = results.recovered
+    study = {name: results.studies[name] for name in ("translucency", "albedo", "brdf")}
+    table = study["translucency"]["translucency_table"].to_dataset().load()
+    histograms = study["albedo"]["albedo"].to_dataset().load()
+    curve = study["brdf"]["basis_size"].to_dataset().load()
+    plots = {
+        "reflectance": reflectance_plot(recovered),
+        "normal": normal_plot(recovered),
+        "translucency": plot_png(plot_translucency(table, ax=axes())),
+        "albedo": plot_png(plot_albedo(histograms, ax=axes())),
+        "basis_size": plot_png(plot_basis_size(curve, ax=axes())),
+    }
+    near = 100 * float(curve[variables.PLATEAU_TOLERANCE])
+    return {
+        "plots": plots,
+        "sites": site_table(results),
+        "basis_size": curve,
+        "plateau_percent": near,
+    }
+
+
+def _population(results: Results, _: Portraits) -> dict[str, Any]:
+    names = ("translucency", "brdf", "albedo")
+    studies = {name: study_table(results.studies[name]) for name in names}
+    columns = [
+        "site",
+        "channel",
+        variables.SIGMA_TR_MEAN,
+        variables.SIGMA_TR_MEAN_LOW,
+        variables.SIGMA_TR_MEAN_HIGH,
     ]
-    inside = [[name, float(np.mean(values))] for name, values in stages.items()]
-    return Table("times_demo", ["stage", "seconds"], demo), Table(
-        "times_fit", ["stage", "seconds"], inside
-    )
+    shown = studies["translucency"][columns]
+    header = ["site", "channel", "mean", "95 % from", "to"]
+    return {"studies": studies, "translucency": shown.set_axis(header, axis=1)}
 
 
-def edit_section(results: Results, portraits: Portraits) -> list[str]:
-    """Pictures of the edited models and their distance from the data; empty if no model
-    was edited.
+def _edit(results: Results, portraits: Portraits) -> dict[str, Any]:
+    """Pictures of the edited models, their distance from the data, and their colour difference
+    from the measured take; None if no model was edited.
     """
     if not results.edits:
-        return []
-    images = {f"{amount:g}": portrait(tree) for amount, tree in results.edits.items()}
-    captions = {
-        f"{amount:g}": _edit_caption(amount, tree.attrs)
-        for amount, tree in results.edits.items()
+        return {"edit": None}
+    images = {}
+    for amount, tree in results.edits.items():
+        distance = tree.attrs["edit_distance"]
+        is_inside = 0 <= amount <= 1 and round(distance, 2) <= INSIDE
+        place = "inside the data" if is_inside else "outside the data"
+        images[f"amount {amount:g}, distance {distance:.2f}: {place}"] = portrait(tree)
+    by_amount = dict(zip(results.edits, images.values(), strict=True))
+    errors: tuple[float, ...] = ()
+    target = results.target_take
+    if target in portraits.images:
+        measured = portraits.images[target]
+        images[f"{target}: the measured take"] = measured
+        if {0.0, 1.0} <= set(by_amount):
+            errors = tuple(
+                compare_images(
+                    by_amount[amount], measured, exposure=portraits.exposure
+                )["delta_e_mean"]
+                for amount in (0.0, 1.0)
+            )
+    traits = study_table(results.studies["traits"])
+    shifts = traits[SHOWN].set_axis([_breakable(name) for name in SHOWN], axis=1)
+    edit = {
+        "take": results.edited_take,
+        "target": target,
+        "trait": next(iter(next(iter(results.edits.values())).attrs["edit"])),
+        "pictures": [(image, text) for text, image in portraits.cut(images).items()],
+        "errors": errors,
+        "traits": traits,
+        "shifts": shifts.assign(trait=shifts["trait"].map(_breakable)),
     }
-    if results.target_take in portraits.images:
-        images[MEASURED] = portraits.images[results.target_take]
-        captions[MEASURED] = f"{results.target_take}: the measured take"
-    drawn = portraits.cut(images)
-    figures = [
-        page.picture(
-            drawn[key], f"{results.edited_take}: {captions[key]}", caption=captions[key]
-        )
-        for key in drawn
-    ]
-    trait = next(iter(next(iter(results.edits.values())).attrs["edit"]))
-    text = (
-        f"{results.edited_take} is moved along the trait vector of {trait}: the "
-        "mean of the takes with the trait minus "
-        "the mean of those without it. The takes span amounts from 0 to 1. The "
-        "distance of an edit is the distance to "
-        "its nearest take, divided by the median distance between takes. If it is "
-        "at most 1, the edit is inside the "
-        "data."
-    )
-    full = study_table("traits", results.studies["traits"])
-    rows = [[_breakable(row[0]), *row[1:]] for row in full.columns(SHOWN).rows]
-    named = page.Table("traits", [_breakable(name) for name in SHOWN], rows)
-    note = (
-        "Shifts are root mean squares of the parts of a vector: coefficients of "
-        "the common basis, and quantiles of "
-        "colour. The file also contains standard errors from a bootstrap over "
-        "subjects. If there is only one take on a "
-        "side, a vector is a difference of two takes and has no standard error."
-    )
-    listed = page.details("Trait vectors", [page.paragraph(note), page.table(named)])
-    comparison = _edit_error(results, portraits, images)
-    return [
-        page.paragraph(text),
-        page.row(figures),
-        *comparison,
-        listed,
-        page.downloads([full]),
-    ]
+    return {"edit": edit}
 
 
 def _breakable(name: str) -> str:
@@ -291,318 +383,11 @@ def _breakable(name: str) -> str:
     return name.replace(":", ": ").replace("_", " ")
 
 
-def _edit_caption(amount: float, attrs: Mapping[Any, Any]) -> str:
-    distance = attrs["edit_distance"]
-    place = (
-        "inside the data"
-        if 0 <= amount <= 1 and round(distance, 2) <= INSIDE
-        else "outside the data"
-    )
-    return f"amount {amount:g}, distance {distance:.2f}: {place}"
-
-
-def _edit_error(
-    results: Results, portraits: Portraits, images: Mapping[str, Image]
-) -> list[str]:
-    """Colour differences of the unedited model and of the edit at amount 1 from the
-    measured take.
-    """
-    if MEASURED not in images or not {"0", "1"} <= set(images):
-        return []
-    target = images[MEASURED]
-    errors = {
-        amount: compare_images(images[amount], target, exposure=portraits.exposure)[
-            "delta_e_mean"
-        ]
-        for amount in ("0", "1")
-    }
-    return [
-        page.paragraph(
-            f"The mean colour difference to the picture of {results.target_take} "
-            f"is {errors['0']:.2g} for the unedited "
-            f"model and {errors['1']:.2g} at amount 1 (CIEDE2000)."
-        )
-    ]
-
-
-def subjects_section(results: Results, portraits: Portraits) -> list[str]:
-    """Table of all takes with small pictures; maps and a predicted photograph can be
-    opened below each row.
-    """
-    viewed = next(iter(results.models))
-    viewer = (
-        f'<p><a href="{VIEWER}">Turn {html.escape(viewed)} and move its lights</a> in '
-        "this browser (WebGL2).</p>"
-    )
-    text = (
-        "The portraits show the fitted models from the front under two lights of "
-        "the dome. Pictures of one kind have "
-        "the same exposure and the same scale for all subjects. Errors are medians "
-        "over the fitted surfels: the angle "
-        "between recovered and true normals, the relative error of the diffuse "
-        "reflectance R_d (mean of the channels), "
-        "and the relative error of samples under lights that the fit did not use."
-    )
-    drawn = portraits.cut(portraits.images)
-    maps = map_pictures(results.models)
-    strips = _strips(results)
-    bodies = []
-    for values in subject_table(results).rows:
-        record = dict(zip(SUBJECT_HEADER, values, strict=True))
-        take = str(record["take"])
-        pictures_of_take = [(drawn[take], "portrait"), *maps[take]]
-        blocks = [
-            page.row(
-                page.picture(image, f"{take}: {name}", caption=name)
-                for image, name in pictures_of_take
-            )
-        ]
-        blocks += [page.row([strips[take]], kind="strip")] if take in strips else []
-        bodies.append(
-            _subject(
-                record,
-                results,
-                page.picture(drawn[take][::2, ::2], _alt(take, record)),
-                blocks,
-            )
-        )
-    head = "".join(
-        f'<th scope="col">{name}</th>'
-        for name in ("Portrait", "Take", "Fitted", "Not fitted", *ERROR_NAMES)
-    )
-    listed = f'<table class="subjects"><thead><tr>{head}</tr></thead>{"".join(bodies)}</table>'
-    saved = page.downloads([subject_table(results), status_table(results)])
-    return [viewer, page.paragraph(text), listed, saved]
-
-
-def _alt(take: str, record: Record) -> str:
-    return f"Portrait of the fitted model of {take}: {_who(record)}"
-
-
-def _who(record: Record) -> str:
-    words = [
-        str(record[name])
-        for name in ("age", "gender", "ancestry", "condition")
-        if record[name] != ""
-    ]
-    return ", ".join(words).replace("_", " ")
-
-
-def _subject(record: Record, results: Results, small: str, maps: list[str]) -> str:
-    """Two rows of the table: the values of a take, and its maps, which can be opened."""
-    take = str(record["take"])
-    counts = status_counts(results.models[take])
-    total = sum(counts.values())
-    statuses = [
-        f"{status.name.lower().replace('_', ' ')} {_percent(100 * count / total)} %"
-        for status, count in sorted(counts.items(), key=lambda item: -item[1])
-        if count and status != FitStatus.FITTED
-    ]
-    channels = [record[f"diffuse_{name}_percent"] for name in ("red", "green", "blue")]
-    cells = {
-        "Fitted": (
-            f"{record['fitted_surfels']:,} of {total:,} surfels "
-            f"({record['fitted_percent']:.1f} %)"
-        ),
-        "Not fitted": ", ".join(statuses) or "none",
-        ERROR_NAMES[0]: page.cell(record["normal_median_deg"]),
-        ERROR_NAMES[1]: page.cell(float(np.mean(channels))),
-        ERROR_NAMES[2]: page.cell(record["held_out_percent"]),
-    }
-    name = f"<b>{html.escape(take)}</b><br>{html.escape(_who(record))}"
-    values = "".join(
-        f'<td data-label="{key}">{html.escape(value)}</td>'
-        for key, value in cells.items()
-    )
-    opened = page.details(f"Pictures and maps of {take}", maps)
-    return (
-        f"<tbody><tr><td>{small}</td><td>{name}</td>{values}</tr><tr><td "
-        f'colspan="7">{opened}</td></tr></tbody>'
-    )
-
-
-def _percent(value: float) -> str:
-    return f"{value:.1f}" if value >= LEAST_PERCENT else f"below {LEAST_PERCENT}"
-
-
-def _strips(results: Results) -> dict[str, str]:
-    """For each take a photograph, its prediction and their difference, under a held-out
-    light if there is one.
-    """
-    chosen = {
-        take: min(compared, key=lambda comparison: not comparison.held_out)
-        for take, compared in results.compared.items()
-        if compared
-    }
-    if not chosen:
-        return {}
-    exposure = min(comparison.error["exposure"] for comparison in chosen.values())
-    strips = predictions(list(chosen.values()), exposure)
-    pictures_by_take = {}
-    for (take, comparison), strip in zip(chosen.items(), strips, strict=True):
-        held = "not used by the fit" if comparison.held_out else "used by the fit"
-        caption = (
-            "Photograph, prediction and ten times their difference (grey is "
-            f"none). Light {comparison.light}, {held}; "
-            f"relative RMSE {100 * comparison.error['relative_rmse']:.1f} %."
-        )
-        pictures_by_take[take] = page.picture(
-            strip, f"{take}: {caption}", caption=caption
-        )
-    return pictures_by_take
-
-
-def write_report(path: Path, results: Results, *, progress: Progress) -> Path:
-    """Write the report, which is viewed without a network, and return its path."""
-    portraits = draw_portraits(results.models)
-    parts = (
-        ("Subjects", subjects_section),
-        ("Surfels without a fit", _statuses),
-        ("Predicted photographs", _predicted),
-        ("Recovered and true values", _recovered),
-        ("Population", _population),
-        ("An edit and its distance from the data", edit_section),
-        ("Run time", _run_time),
-    )
-    sections: list[tuple[str, list[str]]] = []
-    for i, (name, make) in enumerate(parts):
-        progress("report", i, len(parts))
-        if blocks := make(results, portraits):
-            sections.append((name, blocks))
-    minutes = (time.monotonic() - results.began) / 60
-    lead = (
-        f"skindb {__version__} simulated, fitted and analysed "
-        f"{len(results.models)} virtual takes in {minutes:.1f} "
-        "minutes. Their true values are known, so that every error on this page is measured."
-    )
-    private_file(path).write_text(
-        page.page("skindb: measured faces", lead, sections), encoding="utf-8"
-    )
-    progress("report", len(parts), len(parts))
-    return path
-
-
-def _statuses(results: Results, _: Portraits) -> list[str]:
-    text = "Every surfel has a status. Surfels without a fit have a position but no values."
-    return [page.paragraph(text), page.table(status_sums(results))]
-
-
-def _predicted(results: Results, _: Portraits) -> list[str]:
-    full = photograph_table(results)
-    columns = full.columns(
-        ["take", "light", "held_out", "relative_rmse", "delta_e_median"]
-    )
-    held = [row for row in columns.rows if row[2] == "yes"]
-    text = "The fit used the lights of all photographs."
-    if held:
-        error, colour = (float(np.median([row[i] for row in held])) for i in (3, 4))
-        text = (
-            f"The fit did not use the lights of {len(held)} of {len(columns.rows)} "
-            "photographs; for these the median "
-            f"relative RMSE is {100 * error:.1f} % and the median colour "
-            f"difference is {colour:.2g} (CIEDE2000)."
-        )
-    text = (
-        "The photographs that ingest kept are predicted by rendering the model and "
-        "compared over all pixels of the "
-        f"face, including folds and shadow edges. {text}"
-    )
-    named = columns.renamed(["take", "light", "held out", "relative RMSE", "delta E"])
-    listed = page.details(
-        f"Errors of {len(columns.rows)} photographs", [page.table(named)]
-    )
-    return [page.paragraph(text), listed, page.downloads([full])]
-
-
-def _recovered(results: Results, _: Portraits) -> list[str]:
-    text = (
-        "R_d of dark skin is overestimated, because measured BRDFs reflect about "
-        "0.02 evenly in all directions, which "
-        "cannot be separated from diffuse reflection. The errors of sigma_tr "
-        "include the noise of the simulated "
-        "photons of the probe and the effect of the finite size of its fibres."
-    )
-    normals = page.details(
-        "Distribution of the error of normals",
-        [page.normal_plot(results.recovered)],
-    )
-    full = site_table(results)
-    table = full.renamed(["take", "site", "red [%]", "green [%]", "blue [%]"])
-    sites = (
-        [
-            page.details(
-                "Errors of sigma_tr at the sites of the probe", [page.table(table)]
-            )
-        ]
-        if full.rows
-        else []
-    )
-    return [
-        page.paragraph(text),
-        page.reflectance_plot(results.recovered),
-        normals,
-        *sites,
-        page.downloads([full]),
-    ]
-
-
-def _population(results: Results, _: Portraits) -> list[str]:
-    text = (
-        "Mean of sigma_tr over the subjects with its 95 % interval, and the "
-        "distribution of the area of the face by "
-        "albedo along its first decorrelated axis, which is mostly brightness."
-    )
-    study = results.studies["translucency"]
-    plots = [
-        page.translucency_plot(study["translucency_table"].to_dataset().load()),
-        page.albedo_plot(results.studies["albedo"]["albedo"].to_dataset().load()),
-    ]
-    saved = [
-        study_table(name, results.studies[name])
-        for name in ("translucency", "brdf", "albedo")
-    ]
-    columns = saved[0].columns(
-        [
-            "site",
-            "channel",
-            variables.SIGMA_TR_MEAN,
-            variables.SIGMA_TR_MEAN_LOW,
-            variables.SIGMA_TR_MEAN_HIGH,
-        ]
-    )
-    named = columns.renamed(["site", "channel", "mean", "95 % from", "to"])
-    listed = page.details("sigma_tr in 1/mm by site and channel", [page.table(named)])
-    return [
-        page.paragraph(text),
-        page.row(plots, kind="plots"),
-        listed,
-        _basis_size(results),
-        page.downloads(saved),
-    ]
-
-
-def _basis_size(results: Results) -> str:
-    curve = results.studies["brdf"]["basis_size"].to_dataset().load()
-    near = 100 * float(curve[variables.PLATEAU_TOLERANCE])
-    text = (
-        f"Sufficient number of basis BRDFs: {curve.attrs['size_status']}. Its "
-        f"error must be within {near:g} % of that "
-        "of the largest number tried. The error is measured on "
-        f"{curve.attrs['surfels']} surfels of all takes."
-    )
-    return page.details(
-        "Number of basis BRDFs", [page.paragraph(text), page.basis_size_plot(curve)]
-    )
-
-
-def _run_time(results: Results, _: Portraits) -> list[str]:
-    demo, fit = time_tables(results)
-    text = (
-        "Wall time in seconds. Takes are processed in parallel, and the times of their "
-        "stages are summed."
-    )
-    listed = [
-        page.details("Stages of the demo", [page.table(demo)]),
-        page.details("Stages of a fit, mean over takes", [page.table(fit)]),
-    ]
-    return [page.paragraph(text), *listed, page.downloads([demo, fit])]
+def _times(results: Results, _: Portraits) -> dict[str, Any]:
+    """Wall time [s] of the stages of the demo, and of the stages of a fit as mean over takes."""
+    stages = {name: x for name, x in results.seconds.items() if name != "report"}
+    inside = DataFrame([fit["seconds"] for fit in results.fits.values()]).mean()
+    header = ["stage", "seconds"]
+    demo = DataFrame([*stages.items()], columns=header)
+    fits = DataFrame([*inside.items()], columns=header)
+    return {"times": {"demo": demo, "fit": fits}}

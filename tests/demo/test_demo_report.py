@@ -7,6 +7,7 @@ import csv
 import io
 import re
 
+import imagecodecs
 import numpy as np
 import pytest
 from planted_results import (
@@ -19,7 +20,7 @@ from planted_results import (
     planted_results,
 )
 
-from skindb.demo.report import status_sums, write_report
+from skindb.demo.report import cell, status_sums, status_table, write_report
 from skindb.schema import FitStatus
 
 MAX_HEIGHT = 6000  # px at a width of 400 px, as on a telephone
@@ -108,9 +109,36 @@ def test_write_report__without_edits_and_traits(report):
 
 
 def test_status_sums__count_every_surfel_once(results):
-    shown = status_sums(results)
-    assert sum(row[2] for row in shown.rows) == len(TAKES) * SURFELS
-    assert sum(row[3] for row in shown.rows) == pytest.approx(100)
+    shown = status_sums(status_table(results))
+    assert shown["surfels"].sum() == len(TAKES) * SURFELS
+    assert shown["%"].sum() == pytest.approx(100)
+
+
+def test_cell__is_short_and_readable():
+    values = (175952, np.int64(23), 0.012345, 1234.5, np.nan, "a", True)
+    assert [cell(value) for value in values] == [
+        "175,952",
+        "23",
+        "0.0123",
+        "1,234",
+        "-",
+        "a",
+        "True",
+    ]
+
+
+@pytest.mark.slow
+def test_write_report__text_is_escaped_and_pictures_are_readable(report):
+    plain = planted_results((TAKES[0], TAKES[3]))
+    plain.models[TAKES[0]].attrs["traits"] = {"gender": '<i>"x'}
+    text = write_report(
+        report.with_name("plain.html"), plain, progress=lambda *_: None
+    ).read_text()
+    assert "<i>" not in text
+    assert "http" not in re.sub('base64,[^"]+', "", text)
+    assert "Portrait of the fitted model of V001: &lt;i&gt;&#34;x, normal" in text
+    png = base64.b64decode(re.search(r"image/png;base64,([^\"]+)", text)[1])
+    assert imagecodecs.png_decode(png).shape[2] == 3
 
 
 @pytest.mark.slow
