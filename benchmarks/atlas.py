@@ -2,8 +2,7 @@
 
     python -m benchmarks atlas CAPTURE [--levels 3] [--size 2048] [--channels 10]
 
-Rounds are shown for both kinds of weights until one folds; `chosen` is the result of
-`disc_atlas` on the mesh after `--levels` subdivisions. Maps have random values at 95 %
+`chosen` is the result of `disc_atlas` on the mesh after `--levels` subdivisions. Maps have random values at 95 %
 of the vertices; memory is the peak of the process.
 """
 
@@ -30,11 +29,8 @@ def main(
     rounds(mesh.vertices, mesh.faces)
     vertices, faces, matrix = subdivide(mesh.vertices, mesh.faces, levels)
     start = time.process_time()
-    uv, report = atlas.disc_atlas(mesh.vertices, mesh.faces, finer=(matrix, faces))
-    print(
-        f"chosen: {'intrinsic' if report['intrinsic'] else 'mean-value'}, "
-        f"{time.process_time() - start:.1f} CPU s"
-    )
+    uv, _ = atlas.disc_atlas(mesh.vertices, mesh.faces, finer=(matrix, faces))
+    print(f"chosen: {time.process_time() - start:.1f} CPU s")
     print_distortion("chosen", vertices, faces, uv)
     order = morton_order(vertices)
     rank = np.empty_like(order)
@@ -43,17 +39,13 @@ def main(
 
 
 def rounds(vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Print the distortion of every round for both kinds of weights."""
+    """Print the distortion of every round."""
     loops = outline_first(vertices, boundary_loops(faces))
     capped = atlas._cap_holes(vertices, faces, loops[1:])
     rim = atlas._circle(vertices[loops[0]])
     surface = atlas.Surface(*capped, len(faces), loops[0], rim)
-    for kind in ("intrinsic", "mean_value"):
-        weights = getattr(atlas, f"_{kind}_weights")(surface.points, surface.faces)
-        for place, (uv, _) in enumerate(atlas._equalised(surface, weights)):
-            print_distortion(
-                f"{kind}, round {place}", vertices, faces, uv[: len(vertices)]
-            )
+    for place, (uv, _) in enumerate(atlas._equalised(surface)):
+        print_distortion(f"round {place}", vertices, faces, uv[: len(vertices)])
 
 
 def print_distortion(

@@ -341,7 +341,6 @@ def small_database(tmp_path_factory):
     assert re.search(r"samples of +mean +p5 +p50 +p95 +max +seen\n +all ", said)
     assert "stretch 99 %" in said
     assert chosen.strip() in said
-    assert re.search(r"atlas by (intrinsic|mean-value) weights \(", said)
     # a tenth of the lights is one light
     assert len(report["held_out_lights"]) == len(report["held_out_cameras"]) == 1
     return out, db

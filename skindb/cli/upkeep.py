@@ -30,12 +30,6 @@ from skindb.errors import Fault, InputError, input_error
 if TYPE_CHECKING:
     from skindb.store import BackupReport, Database, Garbage, Restored
 
-ATLAS_WEIGHTS = {
-    "intrinsic": "intrinsic weights (Desbrun et al. 2002)",
-    "mean_value": "mean-value weights (Floater 2003), because intrinsic ones would flip triangles",
-    "planar": "coordinates of the picture, without a scan",
-}
-
 
 @command
 @DB
@@ -176,12 +170,7 @@ def _atlas_lines(database: Database, take: str) -> list[str]:
         "flips": variables.ATLAS_FLIPS,
     }
     rows = zip(*(atlas[name].values.tolist() for name in columns.values()), strict=True)
-    heading = (
-        [f"atlas by {ATLAS_WEIGHTS[atlas.attrs['weights']]}"]
-        if "weights" in atlas.attrs
-        else []
-    )
-    return [*heading, *aligned([[*columns], *map(list, rows)])]
+    return aligned([[*columns], *map(list, rows)])
 
 
 def _capture_lines(database: Database, take: str) -> list[str]:

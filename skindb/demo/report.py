@@ -263,6 +263,7 @@ def _subjects(results: Results, portraits: Portraits) -> dict[str, Any]:
                 "who": ", ".join(str(x) for x in who if x != "").replace("_", " "),
                 "not_fitted": _reasons(statuses[statuses["take"] == take]),
                 "portrait": drawn[take],
+                "small": drawn[take][::2, ::2],
                 "maps": maps[take],
                 "prediction": shown.get(take),
                 "strip": strips.get(take),

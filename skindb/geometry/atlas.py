@@ -7,7 +7,6 @@ their gaps filled, and sampled.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from fractions import Fraction
 
 import numpy as np
 import scipy.sparse as sp
@@ -53,9 +52,6 @@ STRETCH_EXPONENT = 0.75
 # 99 % of the area stretched below 5.0 : 1. Round 2 has the smallest energy (0.295,
 # 4.4), later rounds are more even and more stretched (7: 0.083, 5.5)
 EQUAL = 1.005
-# of conformal and authalic weights: fewer flips on heads (1) than with either alone (5,
-# 20)
-MIX = 0.5
 # of the disc, so that its rim keeps a texel from the border of a map of 1,000 and more
 DISC_RADIUS = 0.5 - 1e-3
 TRIANGLES_PER_BLOCK = 1 << 17  # takes 50 MB
@@ -71,11 +67,9 @@ def disc_atlas(
     """Map a surface with at least one boundary into the unit square.
 
     The longest boundary is mapped to a circle by arc length, and every other vertex to
-    a weighted average of its neighbours, with the intrinsic weights of Desbrun et al.
-    (2002), or, if their negative weights turn a triangle over in any round, with
-    mean-value weights (Floater 2003), which cannot do so in a convex outline. In rounds
-    the weights are scaled so that areas become even (Yoshizawa et al. 2004), within
-    limits on the stretch.
+    a weighted average of its neighbours, with mean-value weights (Floater 2003), which
+    cannot turn a triangle over in a convex outline. In rounds the weights are scaled so
+    that areas become even (Yoshizawa et al. 2004), within limits on the stretch.
 
     Parameters
     ----------
@@ -92,9 +86,8 @@ def disc_atlas(
         (v, 2) or (n, 2) in [0, 1], u first; v = 0 is the top row. Seen from outside the
         map is not mirrored, and +y points up.
     report : dict
-        `flips`, triangles turned over (0, counted exactly in the coordinates returned),
-        `area_log2_sd` of the map of the surface given, and `intrinsic`: 1 if Desbrun's
-        weights made it, 0 for mean values.
+        `flips`, triangles turned over (0, counted in the coordinates returned), and
+        `area_log2_sd` of the map of the surface given.
 
     Raises
     ------
@@ -111,19 +104,13 @@ def disc_atlas(
     surface = Surface(*capped, len(corner), outline, _circle(points[outline]))
     matrix, fine = finer or (sp.identity(len(points), format="csr"), corner)
     fewest_flips = len(fine)
-    for intrinsic, weights in ((1, _intrinsic_weights), (0, _mean_value_weights)):
-        maps = _equalised(surface, weights(surface.points, surface.faces))
-        if intrinsic and len(maps) < EQUALISATION_ROUNDS:
-            # negative weights that fold in a later round would leave an uneven map
-            continue
-        for uv, spread in maps:
-            upright = _upright(uv[: len(points)], points, corner)
-            stored = np.clip(matrix @ upright, 0.0, 1.0).astype(np.float32)
-            flips = int(flipped(stored, fine).sum())
-            if not flips:
-                report = {"area_log2_sd": spread, "intrinsic": float(intrinsic)}
-                return stored, {"flips": 0.0, **report}
-            fewest_flips = min(fewest_flips, flips)
+    for uv, spread in _equalised(surface):
+        upright = _upright(uv[: len(points)], points, corner)
+        stored = np.clip(matrix @ upright, 0.0, 1.0).astype(np.float32)
+        flips = int(flipped(stored, fine).sum())
+        if not flips:
+            return stored, {"flips": 0.0, "area_log2_sd": spread}
+        fewest_flips = min(fewest_flips, flips)
     raise input_error(
         "mesh",
         "no triangle may be turned over in the atlas",
@@ -196,34 +183,6 @@ def _circle(path: Array) -> Float64:
     return DISC_RADIUS * np.stack([np.cos(angle), -np.sin(angle)], axis=1)
 
 
-def _intrinsic_weights(points: Array, faces: Index) -> sp.csr_matrix:
-    """Row i: cot of the angles across edge ij, and of those at j beside it over |p_j -
-    p_i|^2 times the area around i.
-
-    Conformal and authalic weights of Desbrun et al. (2002), made comparable by the area.
-    """
-    n = len(points)
-    weights = sp.csr_matrix((n, n))
-    area = lengths(face_crosses(points, faces)) / 2
-    around = np.bincount(faces.ravel(), np.repeat(area, 3), minlength=n) / 3
-    # across corner k
-    sides = [
-        points[faces[:, (k + 2) % 3]] - points[faces[:, (k + 1) % 3]] for k in range(3)
-    ]
-    tiny = 1e-9 * area.max()
-    cot = [
-        -dots(sides[k - 2], sides[k - 1]) / np.maximum(2 * area, tiny) for k in range(3)
-    ]
-    for k in range(3):
-        i = faces[:, (k + 1) % 3]
-        j = faces[:, (k + 2) % 3]
-        square = np.maximum(dots(sides[k], sides[k]), tiny)
-        forth = MIX * cot[k] + (1 - MIX) * around[i] * cot[(k + 2) % 3] / square
-        back = MIX * cot[k] + (1 - MIX) * around[j] * cot[(k + 1) % 3] / square
-        weights = weights + _matrix(n, (i, j, forth), (j, i, back))
-    return weights
-
-
 def _matrix(n: int, *entries: tuple[Index, Index, Array]) -> sp.csr_matrix:
     """Sparse matrix (n, n) of rows, columns and values."""
     rows, columns, values = (
@@ -267,8 +226,7 @@ def _solve(weights: sp.csr_matrix, rim: Index, rim_uv: Array) -> Float64 | None:
         laplacian = (sp.diags(total) - weights).tocsr()
         system = laplacian[inner][:, inner].tocsc()
         # positive weights are diagonally dominant and need no pivoting, which allows a
-        # symmetric ordering (8 x less fill); errors with negative weights are detected
-        # as flips
+        # symmetric ordering (8 x less fill)
         try:
             solver = splu(
                 system,
@@ -282,7 +240,7 @@ def _solve(weights: sp.csr_matrix, rim: Index, rim_uv: Array) -> Float64 | None:
     return uv if np.isfinite(uv).all() else None
 
 
-def _equalised(surface: Surface, weights: sp.csr_matrix) -> list[tuple[Float64, float]]:
+def _equalised(surface: Surface) -> list[tuple[Float64, float]]:
     """Maps without flips and the sd of their log2 area, the best first.
 
     In each round the weights of neighbours in stretched areas are reduced (Yoshizawa et al. 2004).
@@ -290,6 +248,7 @@ def _equalised(surface: Surface, weights: sp.csr_matrix) -> list[tuple[Float64, 
     points = surface.points
     faces = surface.faces
     real = slice(0, surface.real)  # excludes the caps of holes
+    weights = _mean_value_weights(points, faces)
     area = lengths(face_crosses(points, faces)) / 2
     around = np.bincount(faces.ravel(), np.repeat(area, 3), minlength=len(points))
     maps: list[tuple[float, float, Float64]] = []  # energy, sd of log2 area, uv
@@ -329,25 +288,16 @@ def _upright(uv: Array, points: Array, faces: Index) -> Float64:
 
 
 def flipped(uv: Array, faces: Faces) -> Mask:
-    """Mask (f,) of the triangles that are turned over in the map, v downwards; exact
-    for these coordinates.
+    """Mask (f,) of the triangles that are turned over in the map, v downwards, or so thin that
+    rounding hides it.
     """
     wrong = np.empty(len(faces), bool)
     for start in range(0, len(faces), TRIANGLES_PER_BLOCK):
         part = faces[start : start + TRIANGLES_PER_BLOCK]
-        corners = uv[part]
-        plus, minus = _area_products(corners)
-        wrong[start : start + TRIANGLES_PER_BLOCK] = plus <= minus
+        plus, minus = _area_products(uv[part])
         error = CERTAIN * (np.abs(plus) + np.abs(minus))
-        for i in np.flatnonzero(np.abs(plus - minus) <= error):
-            wrong[start + i] = _turned(*corners[i].astype(np.float64))
+        wrong[start : start + TRIANGLES_PER_BLOCK] = plus - minus <= error
     return wrong
-
-
-def _turned(*corners: Array) -> bool:
-    exact = (map(Fraction, corner.tolist()) for corner in corners)
-    (ax, ay), (bx, by), (cx, cy) = exact
-    return (by - ay) * (cx - ax) <= (bx - ax) * (cy - ay)
 
 
 def stretches(

@@ -79,15 +79,11 @@ def mesh_group(capture: Capture, surfels: SurfelSet) -> xr.Dataset:
 def atlas_group(surfels: SurfelSet) -> xr.Dataset:
     """Group "atlas": distortion by the texture coordinates, of the entire face as
     region "all" and of each region.
-
-    Its attribute `weights` names the method: "intrinsic" (Desbrun et al. 2002) or
-    "mean_value" (Floater 2003).
     """
     measures = distortion(surfels.position, surfels.faces, surfels.uv, surfels.region)
     return dataset(
         {f"atlas_{name}": values for name, values in measures.items()},
         coords={"region": ["all", *surfels.region_names]},
-        attrs={"weights": surfels.uv_weights},
     )
 
 

@@ -62,8 +62,6 @@ class SurfelSet:
     faces: Index  # (f, 3)
     region_names: tuple[str, ...]
     region: Mask  # (n, region)
-    # weights that uv were computed with: "intrinsic" or "mean_value"; or "planar"
-    uv_weights: str
 
     def cosine(self, camera: CameraRecord, part: slice = slice(None)) -> Float64:
         """Cosine (n,) between normals and the direction to the camera."""
@@ -93,12 +91,10 @@ def build_surfels(
     mesh = capture.surface
     levels = 0 if planar else subdivision_levels(mesh, spacing_mm)
     vertices, faces, matrix = subdivide(mesh.vertices, mesh.faces, levels)
-    weights = "planar"
     if planar:
         uv = _planar_uv(vertices)
     else:
-        uv, atlas = disc_atlas(mesh.vertices, mesh.faces, finer=(matrix, faces))
-        weights = "intrinsic" if atlas["intrinsic"] else "mean_value"
+        uv = disc_atlas(mesh.vertices, mesh.faces, finer=(matrix, faces))[0]
     order = morton_order(vertices)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
@@ -111,7 +107,6 @@ def build_surfels(
         faces=rank[faces],
         region_names=names,
         region=np.asarray(matrix @ member)[order] > 0.5,
-        uv_weights=weights,
     )
 
 

@@ -87,7 +87,7 @@ SOFT_LIGHT_COUNT = declare(
 SURFEL_UV = declare(
     "float32 surfels/surfel_uv(surfel, uv) [1]",
     "texture coordinates, v = 0 at the top row",
-    "Desbrun et al. 2002 or Floater 2003, equalised as Yoshizawa et al. 2004",
+    "Floater 2003, equalised as Yoshizawa et al. 2004",
     Use.COPIED | Use.SAMPLED | Use.SURVIVES_EDIT,
 )
 LIGHT_VISIBLE_FRACTION = declare(

@@ -120,17 +120,10 @@ def turned_back(uv: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     return np.stack([x.real, -x.imag], axis=1) + 0.5
 
 
-@pytest.mark.parametrize("intrinsic", [1, 0])
-def test_disc_atlas__flat_disc_comes_back_as_itself(intrinsic, monkeypatch):
-    """Both kinds of weights reproduce linear functions of a plane, exactly."""
+def test_disc_atlas__flat_disc_comes_back_as_itself():
+    """Mean-value weights reproduce linear functions of a plane, exactly."""
     v, f = disc()
-    if not intrinsic:  # weights without a solution
-        monkeypatch.setattr(
-            "skindb.geometry.atlas._intrinsic_weights",
-            lambda p, _: sp.csr_matrix((len(p), len(p))),
-        )
     uv, report = disc_atlas(v, f)
-    assert report["intrinsic"] == intrinsic
     wanted = 0.5 + DISC_RADIUS * v[:, :2] / 80 * [1, -1]
     np.testing.assert_allclose(turned_back(uv, wanted), wanted, atol=FLOAT32)
     assert report["area_log2_sd"] < 1e-6
@@ -162,24 +155,6 @@ def test_disc_atlas__of_maps_equally_good_the_most_even_one(monkeypatch):
 def creased(height: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
     v, f = disc(150, seed)
     return v + np.random.default_rng(seed).normal(size=(len(v), 1)) * [0, 0, height], f
-
-
-def obtuse(v: np.ndarray, f: np.ndarray) -> float:
-    side = np.sort(
-        [((v[f[:, k]] - v[f[:, k - 1]]) ** 2).sum(axis=1) for k in range(3)], axis=0
-    )
-    return float((side[2] > side[0] + side[1]).mean())
-
-
-@pytest.mark.parametrize(
-    ("height", "seed", "share", "intrinsic"),
-    [(2, 1, 0.43, 1), (20, 0, 0.73, 0), (8, 1, 0.45, 0)],
-    ids=["few obtuse", "many obtuse: folds at once", "folds when areas are evened"],
-)
-def test_disc_atlas__which_weights(height, seed, share, intrinsic):
-    v, f = creased(height, seed)
-    assert obtuse(v, f) == pytest.approx(share, abs=0.01)
-    assert disc_atlas(v, f)[1]["intrinsic"] == intrinsic
 
 
 @settings(max_examples=15)
@@ -373,7 +348,7 @@ def test_distortion__triangles_without_area_do_not_count():
     assert np.isfinite(area_log2_sd(*stretches(v, flat, uv)))
 
 
-def test_flipped__is_exact_where_rounding_decides():
+def test_flipped__misses_none_where_rounding_decides():
     """Points within 64 roundings of a line (Kettner et al. 2008): double precision has
     the wrong sign at many.
     """
@@ -391,7 +366,7 @@ def test_flipped__is_exact_where_rounding_decides():
 
     expected = np.array([side(p) <= 0 for p in near])
     assert 0 < expected.sum() < n
-    np.testing.assert_array_equal(flipped(uv, f), expected)
+    assert flipped(uv, f)[expected].all()
     a, b, c = (uv[f[:, k]] for k in range(3))
     rounded = (b - a)[:, 1] * (c - a)[:, 0] <= (b - a)[:, 0] * (c - a)[:, 1]
     assert (rounded != expected).sum() > 100

@@ -5,14 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import scipy.sparse as sp
 from sphere import ALBEDO, CAMERAS, INTENSITY, LIGHTS, PROBE_R, RADIUS, face_radiance
 
 from skindb.errors import InputError
 from skindb.ingest import read_capture
 from skindb.ingest.capture import threads
-from skindb.ingest.groups import atlas_group, photograph_group
-from skindb.ingest.surfels import build_surfels
+from skindb.ingest.groups import photograph_group
 from skindb.schema import GROUPS, check
 from skindb.store import Database
 from skindb.workflow import ingest_take
@@ -155,7 +153,6 @@ def test_ingest_capture__the_atlas_as_stored_has_no_flips_and_its_distortion_is_
 ):
     atlas = take["atlas"].to_dataset()
     triangle = take["mesh"]["triangle"].values
-    assert atlas.attrs["weights"] == "intrinsic"  # few obtuse triangles
     uv = take["surfels"]["surfel_uv"].values
     assert uv.dtype == np.float32
     (ax, ay), (bx, by), (cx, cy) = (
@@ -332,17 +329,3 @@ def test_ingest_capture__without_dome_and_probe_keeps_the_surface(
     take = db.read("capture", "T001")
     assert set(take.children) == {"surfels", "mesh", "atlas"}
     assert take["surfels"].sizes["surfel"] > 100
-
-
-def test_atlas_group__names_the_weights_that_made_the_map(capture_folder, monkeypatch):
-    capture = read_capture(capture_folder)
-    assert atlas_group(build_surfels(capture, spacing_mm=6.0)).attrs == {
-        "weights": "intrinsic"
-    }
-    monkeypatch.setattr(
-        "skindb.geometry.atlas._intrinsic_weights",
-        lambda p, _: sp.csr_matrix((len(p), len(p))),
-    )
-    assert atlas_group(build_surfels(capture, spacing_mm=6.0)).attrs == {
-        "weights": "mean_value"
-    }

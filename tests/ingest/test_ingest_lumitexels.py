@@ -66,7 +66,7 @@ def test_fully_lit__keeps_a_pixel_of_the_widest_camera_away_from_a_shadow(captur
     area = vertex_areas(place, faces)
     uv = place[:, :2].astype(np.float32)
     none = np.zeros((len(place), 0), bool)
-    plane = SurfelSet(place, up, area, uv, faces, (), none, "intrinsic")
+    plane = SurfelSet(place, up, area, uv, faces, (), none)
     one = capture.dome.cameras[0]
     fine, coarse = (
         replace(

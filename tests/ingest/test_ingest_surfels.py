@@ -45,7 +45,6 @@ def plate_with_wall(spacing=1.0):
         faces,
         (),
         np.zeros((n, 0), bool),
-        "intrinsic",
     ), RayScene(np.concatenate([plate, wall]), all_faces)
 
 
@@ -144,7 +143,6 @@ def head_and_places(count):
         faces,
         (),
         np.zeros((len(order), 0), bool),
-        "intrinsic",
     )
     direction = np.random.default_rng(5).normal(size=(count, 3)) + np.array([0, 0, 1])
     return (
@@ -336,7 +334,6 @@ def test_visibility__one_triangle(capture):
         faces,
         (),
         np.zeros((3, 0), bool),
-        "intrinsic",
     )
     scene = RayScene(position, faces)
     with ThreadPoolExecutor(1) as pool:
