@@ -2,8 +2,8 @@
 
     python -m benchmarks atlas CAPTURE [--levels 3] [--size 2048] [--channels 10]
 
-`chosen` is the result of `disc_atlas` on the mesh after `--levels` subdivisions. Maps have random values at 95 %
-of the vertices; memory is the peak of the process.
+`chosen` is the result of `disc_atlas` on the mesh after `--levels` subdivisions. Maps have
+random values at 95 % of the vertices; memory is the peak of the process.
 """
 
 from __future__ import annotations
