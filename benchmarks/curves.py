@@ -91,7 +91,7 @@ def transport_curves(quick: bool) -> list[Curve]:
         Curve(
             kernel="transport",
             error_of=f"RMS over {distances} mean free paths of the relative error of R(r)",
-            reference=f"random walk of {walk.packets:,} photons, with the noise `walk_noise`",
+            reference=f"random walk of {walk.packets:,} photons",
             seconds_of="a distance",
             base="skindb dipole, albedo 0.9",
             points=points,
@@ -128,12 +128,7 @@ def _profile(name: str, setting: str, seconds: float, mean, walked) -> Point:
     clear = (noise < NOISY) & np.isfinite(mean)
     off = mean[clear] / value[clear] - 1
     error = float(np.sqrt((off**2).mean()))
-    distances = np.array(DISTANCE)
-    details = {
-        f"at_{d:g}": float(e) for d, e in zip(distances[clear], off, strict=True)
-    }
-    details["walk_noise"] = float(np.sqrt((noise[clear] ** 2).mean()))
-    negative = ", ".join(f"{d:g}" for d in distances[np.isnan(mean)])
+    negative = ", ".join(f"{d:g}" for d in np.array(DISTANCE)[np.isnan(mean)])
     failure = ""
     if name.endswith("dipole"):
         failure = DIFFUSION
@@ -141,7 +136,7 @@ def _profile(name: str, setting: str, seconds: float, mean, walked) -> Point:
         failure = f"negative at {negative} mean free paths (not in the error): too few moments"
     elif name.startswith("moments") and error > 0.1:
         failure = f"{error:.0%} off: too few moments"
-    return Point(name, setting, seconds, error, failure, details)
+    return Point(name, setting, seconds, error, failure)
 
 
 def disc_curves(quick: bool) -> list[Curve]:
@@ -163,12 +158,9 @@ def disc_curves(quick: bool) -> list[Curve]:
         work = partial(convolve_disc, few, DISC, far=far, near=near)
         seconds, averaged = cpu_time(work)
         errors = _relative_errors(averaged.table[nodes], exact)
-        details = dict(zip(names, errors.tolist(), strict=True))
         setting = " and ".join(f"{n} x {m}" for n, m in dict.fromkeys((far, near)))
         error = float(errors.max())
-        points.append(
-            Point("skindb convolve_disc", setting, seconds, error, "", details)
-        )
+        points.append(Point("skindb convolve_disc", setting, seconds, error))
     base = points[-1].name
     error = float(_relative_errors(table[nodes], exact).max())
     failure = "a lamp is not a point, so sharp lobes become too high and too narrow"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from textwrap import fill
@@ -34,8 +34,6 @@ class Point:
     seconds: float  # CPU time of all threads; NaN where the time is not comparable
     error: float
     failure: str = ""  # reason why the method is unsuitable, if it is
-    # other results of the same run
-    details: dict[str, float] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -118,23 +116,16 @@ def plot_curve(curve: Curve, *, ax: Axes) -> Axes:
 
 
 def _plot_method(ax: Axes, points: Sequence[Point], number: int) -> None:
-    colour = f"C{number % 10}"
-    for p in points:
-        if not np.isfinite(p.seconds):
-            y = max(p.error, EXACT)
-            ax.axhline(y, color=colour, ls=":", lw=1, label=p.label)
+    colour = f"C{number}"
     timed = [p for p in points if np.isfinite(p.seconds)]
-    if not timed:
-        return
-    x = [p.seconds for p in timed]
-    errors = [max(p.error, EXACT) for p in timed]
-    marker = "x" if all(p.failure for p in timed) else "os^Dv"[number // 10 % 5]
-    ax.plot(x, errors, marker=marker, lw=0.4, color=colour, label=timed[0].label)
-    for p, place in zip(timed, zip(x, errors, strict=True), strict=True):
-        ax.annotate(
-            p.parameter,
-            place,
-            fontsize=6,
-            xytext=(4, 3),
-            textcoords="offset points",
-        )
+    for p in points:
+        y = max(p.error, EXACT)
+        if p in timed:
+            ax.annotate(p.parameter, (p.seconds, y), fontsize=6)
+        else:
+            ax.axhline(y, color=colour, ls=":", lw=1, label=p.label)
+    if timed:
+        x = [p.seconds for p in timed]
+        errors = [max(p.error, EXACT) for p in timed]
+        marker = "x" if all(p.failure for p in timed) else "o"
+        ax.plot(x, errors, marker=marker, lw=0.4, color=colour, label=timed[0].label)

@@ -20,7 +20,7 @@ from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.mixture import basis_rows
 from skindb.reflectance.separation import surface_lobes
 from skindb.schema import dataset, label, variables
-from skindb.types import Array, Mask, Values16, dots
+from skindb.types import Array, Mask, Values16, dots, finite_rows
 from skindb.virtual.dome import Sensor
 
 ETA = 1.3
@@ -173,11 +173,7 @@ def _normals(skin: ModelSamples, method: str, samples: str) -> Point:
     work = partial(estimate_normals, skin.lumitexels, **options)
     seconds, estimate = cpu_time(work, len(skin.normal))
     angle = _angles(estimate[variables.SHADING_NORMAL].values, skin.normal)
-    details = {
-        "p95": float(np.nanquantile(angle, 0.95)),
-        "estimated": float(np.isfinite(angle).mean()),
-    }
-    return Point(method, samples, seconds, float(np.nanmedian(angle)), "", details)
+    return Point(method, samples, seconds, float(np.nanmedian(angle)))
 
 
 def _angles(normal: Array, true: Array) -> Array:
@@ -212,9 +208,8 @@ def _albedo(skin: ModelSamples, samples: str) -> Point:
     failure = ""
     if estimated <= 0.5:
         failure = f"{1 - estimated:.0%} of the surfels have too few samples"
-    details = {"bias": float(np.nanmedian(relative)), "estimated": estimated}
     error = float(np.nanmedian(np.abs(relative)))
-    return Point("separated", samples, seconds, error, failure, details)
+    return Point("separated", samples, seconds, error, failure)
 
 
 def exposures_curves(quick: bool) -> list[Curve]:
@@ -238,22 +233,25 @@ def exposures_curves(quick: bool) -> list[Curve]:
         times = tuple(float(s) for s in SHORTEST * STEP ** np.arange(count))
         frames = [sensor.expose(truth * np.float32(s), still, rng=rng) for s in times]
         work = partial(merge_exposures, frames, times, record)
-        seconds, (merged, error, flag) = cpu_time(work, side**2)
-        usable = np.asarray(flag == OK)
-        point = _radiance(
-            "skindb merge_exposures", count, seconds, merged, truth, usable
-        )
-        z = (merged - truth)[usable] / error[usable]
-        point.details["scatter_over_claimed_error"] = float(np.sqrt((z**2).mean()))
-        points.append(point)
+        setting = f"{count} exposure{'s' * (count > 1)}"
+        seconds, (merged, _, flag) = cpu_time(work, side**2)
+        error = _radiance_error(merged, truth, np.asarray(flag == OK))
+        points.append(Point("skindb merge_exposures", setting, seconds, error))
         work_of_longest = partial(_longest_exposure, frames, times, sensor)
         seconds, longest = cpu_time(work_of_longest, side**2)
         name = "longest exposure that is not saturated"
-        usable = np.asarray(np.isfinite(longest).all(-1))
-        points.append(_radiance(name, count, seconds, longest, truth, usable))
+        error = _radiance_error(longest, truth, finite_rows(longest))
+        points.append(Point(name, setting, seconds, error))
     medium = (SHORTEST * STEP**2,)
     frame = sensor.expose(truth * np.float32(medium[0]), still, rng=rng)
-    points.append(_one_exposure(frame, medium, record, truth))
+    radiance, _, flag = merge_exposures([frame], medium, record)
+    usable = np.asarray(flag == OK)
+    failure = (
+        f"{1 - usable.mean():.0%} of the pixels are white or black: one exposure does "
+        "not cover four decades"
+    )
+    error = _radiance_error(radiance, truth, usable)
+    points.append(Point("one medium exposure", "", np.nan, error, failure))
     return [
         Curve(
             kernel="exposures",
@@ -268,22 +266,6 @@ def exposures_curves(quick: bool) -> list[Curve]:
     ]
 
 
-def _one_exposure(
-    frame: Values16,
-    times: tuple[float, ...],
-    record: SensorRecord,
-    truth: Array,
-) -> Point:
-    radiance, _, flag = merge_exposures([frame], times, record)
-    usable = np.asarray(flag == OK)
-    failure = (
-        f"{1 - usable.mean():.0%} of the pixels are white or black: one exposure does "
-        "not cover four decades"
-    )
-    name = "one medium exposure"
-    return _radiance(name, 1, np.nan, radiance, truth, usable, failure)
-
-
 def _longest_exposure(
     frames: list[Values16], times: tuple[float, ...], sensor: Sensor
 ) -> Array:
@@ -295,20 +277,6 @@ def _longest_exposure(
     return radiance
 
 
-def _radiance(
-    name: str,
-    count: int,
-    seconds: float,
-    radiance: Array,
-    truth: Array,
-    usable: Mask,
-    failure: str = "",
-) -> Point:
-    relative = np.abs(radiance[usable] / truth[usable] - 1)
-    details = {
-        "p95": float(np.quantile(relative, 0.95)),
-        "without_value": float(1 - usable.mean()),
-    }
-    setting = f"{count} exposure{'s' * (count > 1)}"
-    error = float(np.median(relative))
-    return Point(name, setting, seconds, error, failure, details)
+def _radiance_error(radiance: Array, truth: Array, usable: Mask) -> float:
+    """Median relative error of the usable pixels."""
+    return float(np.median(np.abs(radiance[usable] / truth[usable] - 1)))

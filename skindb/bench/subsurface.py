@@ -35,7 +35,6 @@ ETA = 1.3
 FAR_OFF = 0.25  # relative error above which a fit counts as failed
 FAILS_WITH_FREE_GAIN = "a free gain has two minima; measure the gain"
 FAILS_WHERE_NEAR = "the profile is wrong where the albedo is low or the fibres are near"
-CANCELLATION = "1 - alpha' is lost to cancellation"
 FIBRES = 1 + 0.5 * np.arange(28)  # mm, of the probe
 # sigma_a, sigma_s' [mm-1] of kinds of skin; albedo 0.98 to 0.59
 SKIN = ((0.05, 2.4), (0.17, 2.3), (0.36, 2.9), (0.3, 1.0), (0.54, 0.79))
@@ -67,29 +66,24 @@ def inverse_curves(quick: bool) -> list[Curve]:
     seconds, (s, _) = cpu_time(partial(dipole_s, diffuse, eta=ETA), count)
     seconds_of_brentq, of_brentq = cpu_time(partial(_by_brentq, diffuse), count)
     albedo = reduced_albedo(exact)
-    from_double = np.sqrt(3 * (1 - albedo))
     from_single = np.sqrt(3 * (1 - albedo.astype(np.float32).astype(float)))
     s_bright = _exact(0.999)
     lost = (1 - np.float32(reduced_albedo(s_bright))) / (s_bright**2 / 3) - 1
     brentq_fails = "1 - R_d(s) is lost to cancellation where R_d is near 1"
-    double_fails = f"{CANCELLATION} near 1"
     single_fails = (
-        f"{CANCELLATION}: {abs(lost):.0%} off at R_d = 0.999, all of it at 1 - 1e-9"
+        "1 - alpha' is lost to cancellation: "
+        f"{abs(lost):.0%} off at R_d = 0.999, all of it at 1 - 1e-9"
     )
     stored = s.astype(np.float32)
     brentq_name = "SciPy brentq on eq. 5"
     points = [
-        _inverse("skindb dipole_s", seconds, s / exact),
-        _inverse(
-            "skindb dipole_s, stored in single precision", seconds, stored / exact
-        ),
-        _inverse(brentq_name, seconds_of_brentq, of_brentq / exact, brentq_fails),
-        _inverse(
-            "alpha' in double precision", seconds, from_double / exact, double_fails
-        ),
-        _inverse(
-            "alpha' in single precision", seconds, from_single / exact, single_fails
-        ),
+        Point(name, "", cost, float(np.abs(estimate / exact - 1).max()), failure)
+        for name, cost, estimate, failure in (
+            ("skindb dipole_s", seconds, s, ""),
+            ("skindb dipole_s, stored in single precision", seconds, stored, ""),
+            (brentq_name, seconds_of_brentq, of_brentq, brentq_fails),
+            ("alpha' in single precision", seconds, from_single, single_fails),
+        )
     ]
     return [
         Curve(
@@ -101,13 +95,6 @@ def inverse_curves(quick: bool) -> list[Curve]:
             points=points,
         )
     ]
-
-
-def _inverse(name: str, seconds: float, ratio: Array, failure: str = "") -> Point:
-    """The point of estimates of s with a `ratio` to the exact s."""
-    off = np.abs(ratio - 1)
-    median = {"median": float(np.median(off))}
-    return Point(name, "", seconds, float(off.max()), failure, median)
 
 
 def _by_brentq(diffuse: Array) -> Array:
@@ -164,13 +151,10 @@ def probe_curves(quick: bool) -> list[Curve]:
             seconds, fits = cpu_time(work, len(skin))
             off = np.array([fit.sigma_tr for fit in fits]) / true - 1
             failure = _failure_of_fits(off, free)
-            details = {
-                f"{a:g}, {s:g}": float(e) for (a, s), e in zip(skin, off, strict=True)
-            }
             name = f"skindb transport, gain {'fitted' if free else 'known'}"
             setting = f"{fibres} fibres"
             error = float(np.sqrt(np.nanmean(off**2)))
-            points.append(Point(name, setting, seconds, error, failure, details))
+            points.append(Point(name, setting, seconds, error, failure))
     return [
         Curve(
             kernel="probe",
@@ -207,7 +191,7 @@ def _failure_of_fits(off: Array, free: bool) -> str:
         reason = FAILS_WITH_FREE_GAIN if free else FAILS_WHERE_NEAR
         return f"{largest:.0%} off in one medium: {reason}"
     if not np.isfinite(off).all():
-        return "some profiles were not fitted, see `details`"
+        return "some profiles were not fitted"
     return ""
 
 

@@ -3,7 +3,7 @@ SciPy's solver, factorisations with scikit-learn, and tables averaged over a dis
 """
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 
@@ -41,8 +41,6 @@ TRUTH = (
 )
 SCIPY = "SciPy nnls, precomputed rows, three channels"
 COMPONENTS = 6  # of the planted factorisation
-
-Predict = Callable[[slice, int], Array]  # surface reflectance of rows of a surfel
 
 
 @dataclass(frozen=True)
@@ -177,24 +175,16 @@ def scipy_loop(
     return np.array(solutions)
 
 
-def _errors(samples: Strip, count: int, predict: Predict) -> tuple[float, ...]:
-    """Medians over surfels of the true errors, linear and in cube-root space, and of |M
-    x - R| / |R|.
-    """
+def _errors(samples: Strip, count: int, weight: Array) -> list[float]:
+    """Medians over surfels of the true errors of mixtures, linear and in cube-root space."""
     errors = []
     for s, part in enumerate(samples.parts(count)):
-        y = predict(part, s)
+        y = samples.rows[part] @ weight[s]
         true = samples.true[part]
-        target = samples.target[part]
-        roots = np.cbrt(true)
-        errors.append(
-            [
-                np.linalg.norm(y - true) / np.linalg.norm(true),
-                np.linalg.norm(np.cbrt(y) - roots) / np.linalg.norm(roots),
-                np.linalg.norm(y[:, None] - target) / np.linalg.norm(target),
-            ]
-        )
-    return tuple(np.median(errors, axis=0).tolist())
+        pairs = ((y, true), (np.cbrt(y), np.cbrt(true)))
+        errors.append([lengths(a - b) / lengths(b) for a, b in pairs])
+    medians: list[float] = np.median(errors, axis=0).tolist()
+    return medians
 
 
 def _fit(samples: Strip, model: Mixture, mode: str) -> tuple[float, SurfaceFit]:
@@ -205,36 +195,22 @@ def _fit(samples: Strip, model: Mixture, mode: str) -> tuple[float, SurfaceFit]:
     return cpu_time(partial(model.fit, samples.block, comparison), surfels)
 
 
-def _mixed(samples: Strip, weight: Array) -> Predict:
-    return lambda part, s: np.asarray(samples.rows[part] @ weight[s])
-
-
 def _both_spaces(
     kernel: str,
     reference: str,
     base: str,
-    results: Sequence[tuple[Point, tuple[float, ...]]],
+    results: Sequence[tuple[str, str, float, list[float]]],
 ) -> list[Curve]:
-    """Curves of the errors in linear and in cube-root space."""
+    """Curves of the errors in linear and in cube-root space, from method, setting, CPU time and
+    both errors of each result.
+    """
     curves = []
     for i, label in enumerate((LINEAR, ROOTS)):
-        points = []
-        for p, errors in results:
-            details = p.details | {"residual": errors[2]}
-            point = Point(
-                p.method, p.parameter, p.seconds, errors[i], p.failure, details
-            )
-            points.append(point)
-        curves.append(
-            Curve(
-                kernel=kernel,
-                error_of=label,
-                reference=reference,
-                seconds_of="a surfel",
-                base=base,
-                points=points,
-            )
-        )
+        points = [
+            Point(method, setting, seconds, errors[i])
+            for method, setting, seconds, errors in results
+        ]
+        curves.append(Curve(kernel, label, reference, "a surfel", base, points))
     return curves
 
 
@@ -249,22 +225,15 @@ def surface_curves(quick: bool) -> list[Curve]:
         for name, channels in (("mean of channels", 1), ("three channels", 3)):
             work = partial(scipy_loop, samples, few, channels=channels, table=table)
             seconds, weight = cpu_time(work, few)
-            point = Point(f"SciPy nnls, {rows}, {name}", "", seconds, np.nan)
-            results.append((point, _errors(samples, few, _mixed(samples, weight))))
+            errors = _errors(samples, few, weight)
+            results.append((f"SciPy nnls, {rows}, {name}", "", seconds, errors))
     for mode in ("linear", "perceptual"):
         for rank in (16, 59) if quick else (8, 12, 16, 24, 59):
             table = dictionary.table
             model = Mixture(*reduce_dictionary(table, rank, exact=dictionary.exact))
             seconds, fit = _fit(samples, model, mode)
-            details = {
-                "kkt": float(fit.kkt.max()),
-                "not_fitted": float((fit.status != 0).sum()),
-            }
-            point = Point(
-                f"skindb {mode}", f"rank {rank}", seconds, np.nan, "", details
-            )
-            mixed = _mixed(samples, fit.parameters)
-            results.append((point, _errors(samples, few, mixed)))
+            errors = _errors(samples, few, fit.parameters)
+            results.append((f"skindb {mode}", f"rank {rank}", seconds, errors))
     return _both_spaces("surface", TRUTH, SCIPY, results)
 
 
@@ -286,10 +255,10 @@ def refit_curves(quick: bool) -> list[Curve]:
     judge()  # compiles
     seconds, judged = cpu_time(judge, surfels)
     measured.append(("skindb with errors, linear", seconds, judged.parameters))
-    results = []
-    for name, seconds, weight in measured:
-        point = Point(name, "4 bases", seconds, np.nan)
-        results.append((point, _errors(samples, few, _mixed(samples, weight @ H))))
+    results = [
+        (name, "4 bases", seconds, _errors(samples, few, weight @ H))
+        for name, seconds, weight in measured
+    ]
     reference = f"{TRUTH}, which four mixtures cannot represent"
     return _both_spaces("refit", reference, f"{SCIPY}, 4 bases", results)
 
@@ -313,6 +282,10 @@ def nmf_curves(quick: bool) -> list[Curve]:
             seconds, factors = cpu_time(partial(_by_scikit, X, solver, steps))
             method = f"scikit-learn {solver}"
             results.append((method, f"{steps} iterations", seconds, factors))
+    reference = (
+        f"{len(X)} planted mixtures of {COMPONENTS} with 20 % scatter, so that the error "
+        "cannot be zero"
+    )
     curves = []
     for name, metric in (("weights", np.eye(len(gram))), ("BRDFs", gram)):
         points = [
@@ -320,19 +293,8 @@ def nmf_curves(quick: bool) -> list[Curve]:
             for method, setting, seconds, factors in results
         ]
         error = f"|X - W H| / |X| between {name}"
-        curves.append(
-            Curve(
-                kernel="nmf",
-                error_of=error,
-                reference=(
-                    f"{len(X)} planted mixtures of {COMPONENTS} with 20 % scatter, so that the "
-                    "error cannot be zero"
-                ),
-                seconds_of="a factorisation",
-                base="scikit-learn cd, 200 iterations",
-                points=points,
-            )
-        )
+        base = "scikit-learn cd, 200 iterations"
+        curves.append(Curve("nmf", error, reference, "a factorisation", base, points))
     return curves
 
 
