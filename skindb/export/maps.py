@@ -1,5 +1,8 @@
 """Texture maps of a fitted model in its texture atlas, and tangent frames as in glTF 2.0."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,22 +27,27 @@ from skindb.types import (
 )
 
 Image = Float32
+RGB = ("R", "G", "B")
 MEASURED = {  # map: variable of the model; edited models have none of these
     "albedo_error": variables.DIFFUSE_REFLECTANCE_TOTAL_ERROR,
     "normal_error": variables.NORMAL_TOTAL_ERROR,
     "surface_reflectance": variables.SURFACE_REFLECTANCE,
     "surface_reflectance_error": variables.SURFACE_REFLECTANCE_ERROR,
 }
+UNIT_VECTORS = {
+    "normal": "unit shading normal, with x, y, z of the subject frame in R, G, B",
+    "normal_tangent": "unit shading normal, with its parts along tangent, bitangent (towards "
+    "v = 0) and normal in R, G, B",
+}
+TRANSLUCENCY = {
+    "translucency": "translucency 1 / sigma_tr, the diffusion length",
+    "mean_free_path": "mean free path with which a random walk under the skin, as of OpenPBR, "
+    "spreads light as far as the dipole with this sigma_tr",
+}
 CONFIDENCE = (
     "1 between fitted surfels, less towards doubtful ones, 0 where values are filled "
     "in from the surroundings"
 )
-TRANSLUCENCY = {
-    "translucency": "translucency 1 / sigma_tr, the diffusion length",
-    "mean_free_path": "mean free path with which a random walk under the skin, as of OpenPBR, "
-    "spreads light as far as "
-    "the dipole with this sigma_tr",
-}
 STATUS = "; ".join(f"{int(code)} {code.explanation}" for code in TexelStatus)
 
 
@@ -55,28 +63,55 @@ class TextureMap:
 
 @dataclass(frozen=True)
 class Atlas:
-    """Texture coordinates of one model, and the triangle that covers each texel."""
+    """The triangles of one model (f, 3), and the triangle that covers each texel."""
 
-    uv: Image  # (n, 2)
-    triangles: Index32  # (f, 3)
+    triangles: Index32
     raster: tuple[Index32, Image]
 
+    @classmethod
+    def of(cls, model: xr.DataTree, size: int) -> Atlas:
+        """The atlas of a model with `size` texels along each side."""
+        uv = model["fitted"].to_dataset()[variables.SURFEL_UV].values
+        triangles = model["mesh"].to_dataset()[variables.TRIANGLE].values
+        return cls(triangles, rasterise_atlas(uv, triangles, size))
 
-def atlas_images(
-    model: xr.DataTree,
-    columns: dict[str, Float32],
-    trust: Float32,
-    *,
-    size: int,
-) -> tuple[Image, dict[str, int]]:
-    """Texels (size, size, c) of concatenated values (n, c) at the surfels, and the
-    number of channels of each name.
-    """
-    uv = model["fitted"].to_dataset()[variables.SURFEL_UV].values
-    triangles = model["mesh"].to_dataset()[variables.TRIANGLE].values
-    atlas = Atlas(uv, triangles, rasterise_atlas(uv, triangles, size))
-    image, _ = _spread(np.concatenate(list(columns.values()), axis=1), trust, atlas)
-    return image, {name: values.shape[1] for name, values in columns.items()}
+    def confidence(self, trust: Float32) -> Image:
+        """Mean trust (size, size) of the corners in each texel."""
+        return atlas_values(trust[:, None], trust, self.triangles, self.raster)[1]
+
+    def spread(self, columns: AnyArray, trust: Float32) -> Image:
+        """Texels (size, size, c) of values (n, c), interpolated and filled in from the
+        surroundings.
+        """
+        image, confidence = atlas_values(columns, trust, self.triangles, self.raster)
+        # texels are smoothed only if adjacent ones have a higher confidence, so that
+        # evenly doubtful regions stay sharp
+        tiny = np.finfo(np.float32).tiny
+        surest = np.maximum(ndimage.maximum_filter(confidence, 3), tiny)
+        return push_pull(image, confidence / surest)[0]
+
+    def spread_known(
+        self, parts: Mapping[str, AnyArray], trust: Float32
+    ) -> dict[str, Image]:
+        """Texels (size, size, c) by name of values (n, c), each from the trusted surfels
+        where it is finite.
+
+        Names that are known nowhere are omitted. Those that are known at the same surfels
+        are processed together, as triangles take more time than values.
+        """
+        together: dict[bytes, list[str]] = {}
+        for name, values in parts.items():
+            finite = finite_rows(values) & (trust > 0)
+            if finite.any():
+                together.setdefault(finite.tobytes(), []).append(name)
+        images: dict[str, Image] = {}
+        for mask, names in together.items():
+            known = np.where(np.frombuffer(mask, bool), trust, np.float32(0))
+            columns = np.concatenate([parts[name] for name in names], axis=1)
+            ends = np.cumsum([parts[name].shape[1] for name in names])[:-1]
+            planes = np.split(self.spread(columns, known), ends, axis=-1)
+            images |= dict(zip(names, planes, strict=True))
+        return {name: images[name] for name in parts if name in images}
 
 
 def texture_maps(
@@ -113,189 +148,69 @@ def texture_maps(
     model = as_mixture(model)
     fitted = required(model)
     trust = surfel_confidence(fitted)
-    uv = fitted[variables.SURFEL_UV].values
-    triangles = model["mesh"].to_dataset()[variables.TRIANGLE].values
-    atlas = Atlas(
-        uv, triangles, rasterise_atlas(uv, triangles, chosen_size(model, size))
-    )
-    columns, layout = _columns(fitted, triangles)
-    image, confidence = _spread(columns, trust, atlas)
-    status = texel_codes(surfel_texels(fitted), triangles, *atlas.raster)
-    quality = {
-        "confidence": _single_channel(confidence, CONFIDENCE),
-        "status": _single_channel(status, STATUS),
-    }
-    return (
-        _fitted_maps(image, layout)
-        | _translucency(fitted, trust, atlas)
-        | _measured(fitted, trust, atlas)
-        | quality
-    )
-
-
-def _spread(columns: AnyArray, trust: Float32, atlas: Atlas) -> tuple[Image, Image]:
-    """Texels (size, size, c), interpolated and filled in from the surroundings, and
-    their confidence (size, size).
-    """
-    image, confidence = atlas_values(
-        columns, trust, atlas.uv, atlas.triangles, atlas.raster
-    )
-    # texels are smoothed only if adjacent ones have a higher confidence, so that evenly
-    # doubtful regions stay sharp
-    surest = np.maximum(
-        ndimage.maximum_filter(confidence, 3), np.finfo(np.float32).tiny
-    )
-    return push_pull(image, confidence / surest)[0], confidence
-
-
-def _columns(
-    fitted: xr.Dataset, triangles: AnyArray
-) -> tuple[AnyArray, dict[str, slice]]:
-    """Concatenated values (n, c) that every trusted surfel has, and the columns of each
-    variable.
-    """
-    parts = {
-        variables.DIFFUSE_REFLECTANCE: even_diffuse(fitted),
-        variables.SHADING_NORMAL: fitted[variables.SHADING_NORMAL].values,
-        variables.BASIS_WEIGHT: fitted[variables.BASIS_WEIGHT].values,
-    }
-    mesh = fitted[variables.SURFEL_NORMAL].values.astype(float)
-    uv = fitted[variables.SURFEL_UV].values
-    frames = tangent_frames(
-        fitted[variables.SURFEL_POSITION].values, mesh, uv, triangles
-    )
-    parts["tangent"] = to_tangent_space(
-        parts[variables.SHADING_NORMAL], mesh, frames
-    ).astype(np.float32)
-    layout = {}
-    start = 0
-    for name, part in parts.items():
-        layout[name] = slice(start, start + part.shape[1])
-        start += part.shape[1]
-    return np.concatenate(list(parts.values()), axis=1), layout
-
-
-def _translucency(
-    fitted: xr.Dataset, trust: Float32, atlas: Atlas
-) -> dict[str, TextureMap]:
-    """Maps of the channels that are known at any trusted surfel, each filled
-    separately; empty if there are none.
-    """
-    if variables.SIGMA_TR not in fitted:
-        return {}
-    sigma_tr = fitted[variables.SIGMA_TR].values
-    diffuse = fitted[variables.DIFFUSE_REFLECTANCE].values
-    sigma_tr = np.where(sigma_tr > 0, sigma_tr, np.nan)
-    path = mean_free_path(
-        diffuse, sigma_tr, eta=float(fitted[variables.REFRACTIVE_INDEX])
-    ).astype(np.float32)
-    values: dict[str, AnyArray] = {
-        "translucency": 1 / sigma_tr,
-        "mean_free_path": path,
-    }
-    parts = {
-        name + channel: value[:, [c]]
-        for name, value in values.items()
-        for c, channel in enumerate("RGB")
-    }
-    planes = _spread_known(parts, trust, atlas)
-    maps = {}
+    atlas = Atlas.of(model, chosen_size(model, size))
+    images = atlas.spread_known(_columns(fitted, atlas.triangles), trust)
+    albedo = "diffuse reflectance R_d plus even_reflection of the surface"
+    maps = {"albedo": TextureMap(images["albedo"], RGB, "1", albedo)}
+    for name, doc in UNIT_VECTORS.items():
+        maps[name] = TextureMap(unit(images[name]), RGB, "1", doc)
+    for k in range(fitted[variables.BASIS_WEIGHT].shape[1]):
+        weight = images[f"weight_{k}"]
+        doc = f"weight of component {k}"
+        maps[f"weight_{k}"] = TextureMap(weight, ("Y",), "1", doc)
     for name, doc in TRANSLUCENCY.items():
-        channels = tuple(channel for channel in "RGB" if name + channel in planes)
+        channels = tuple(channel for channel in RGB if name + channel in images)
         if channels:
-            image = np.concatenate(
-                [planes[name + channel] for channel in channels], axis=-1
-            )
-            maps[name] = TextureMap(image, channels, "mm", doc)
+            planes = [images[name + channel] for channel in channels]
+            maps[name] = TextureMap(np.concatenate(planes, -1), channels, "mm", doc)
+    for name, variable in MEASURED.items():
+        if name in images:
+            spec = VARIABLES[variable]
+            channels = RGB if images[name].shape[-1] == 3 else ("Y",)
+            maps[name] = TextureMap(images[name], channels, spec.units, spec.doc)
+    confidence = atlas.confidence(trust)
+    status = texel_codes(surfel_texels(fitted), atlas.triangles, *atlas.raster)
+    for name, plane, doc in (
+        ("confidence", confidence, CONFIDENCE),
+        ("status", status, STATUS),
+    ):
+        single = plane.astype(np.float32)[..., None]
+        maps[name] = TextureMap(single, ("Y",), "1", doc)
     return maps
 
 
-def _measured(
-    fitted: xr.Dataset, trust: Float32, atlas: Atlas
-) -> dict[str, TextureMap]:
-    """Maps of errors and of surface reflectance, if any trusted surfel has them.
+def _columns(fitted: xr.Dataset, triangles: AnyArray) -> dict[str, AnyArray]:
+    """Values (n, c) at the surfels of each map, and of each channel of the translucency, which
+    may be unknown in some.
 
     Errors are interpolated like values, which overestimates them if the errors of
     surfels are independent.
     """
-    values = {
-        name: fitted[variable].values
-        for name, variable in MEASURED.items()
-        if variable in fitted
+    shading = fitted[variables.SHADING_NORMAL].values
+    mesh = fitted[variables.SURFEL_NORMAL].values.astype(float)
+    uv = fitted[variables.SURFEL_UV].values
+    position = fitted[variables.SURFEL_POSITION].values
+    frames = tangent_frames(position, mesh, uv, triangles)
+    weights = fitted[variables.BASIS_WEIGHT].values
+    columns = {
+        "albedo": even_diffuse(fitted),
+        "normal": shading,
+        "normal_tangent": to_tangent_space(shading, mesh, frames).astype(np.float32),
+        **{f"weight_{k}": column[:, None] for k, column in enumerate(weights.T)},
     }
-    images = _spread_known(
-        {name: value.reshape(len(trust), -1) for name, value in values.items()},
-        trust,
-        atlas,
-    )
-    maps = {}
-    for name, image in images.items():
-        spec = VARIABLES[MEASURED[name]]
-        channels = ("R", "G", "B") if image.shape[-1] == 3 else ("Y",)
-        maps[name] = TextureMap(image, channels, spec.units, spec.doc)
-    return maps
-
-
-def _spread_known(
-    parts: dict[str, AnyArray], trust: Float32, atlas: Atlas
-) -> dict[str, Image]:
-    """Texels (size, size, c) by name of values (n, c), each from the trusted surfels
-    where it is finite.
-
-    Names that are known nowhere are omitted. Those that are known at the same surfels
-    are processed together, as triangles take more time than values.
-    """
-    together: dict[bytes, list[str]] = {}
-    for name, values in parts.items():
-        finite = finite_rows(values) & (trust > 0)
-        if finite.any():
-            together.setdefault(finite.tobytes(), []).append(name)
-    images: dict[str, Image] = {}
-    for mask, names in together.items():
-        columns = np.concatenate([parts[name] for name in names], axis=1)
-        image, _ = _spread(
-            columns, np.where(np.frombuffer(mask, bool), trust, np.float32(0)), atlas
-        )
-        ends = np.cumsum([parts[name].shape[1] for name in names])[:-1]
-        images |= dict(zip(names, np.split(image, ends, axis=-1), strict=True))
-    return {name: images[name] for name in parts if name in images}
-
-
-def _single_channel(values: AnyArray, doc: str) -> TextureMap:
-    return TextureMap(values.astype(np.float32)[..., None], ("Y",), "1", doc)
-
-
-def _fitted_maps(image: Image, layout: dict[str, slice]) -> dict[str, TextureMap]:
-    rgb = ("R", "G", "B")
-    normal = image[..., layout[variables.SHADING_NORMAL]]
-    normal = unit(normal)
-    maps = {
-        "albedo": TextureMap(
-            image[..., layout[variables.DIFFUSE_REFLECTANCE]],
-            rgb,
-            "1",
-            "diffuse reflectance R_d plus even_reflection of the surface",
-        ),
-        "normal": TextureMap(
-            normal,
-            rgb,
-            "1",
-            "unit shading normal, with x, y, z of the subject frame in R, G, B",
-        ),
-    }
-    bent = image[..., layout["tangent"]]
-    bent = unit(bent)
-    doc = (
-        "unit shading normal, with its parts along tangent, bitangent (towards v = 0) "
-        "and normal in R, G, B"
-    )
-    maps["normal_tangent"] = TextureMap(bent, rgb, "1", doc)
-    weights = image[..., layout[variables.BASIS_WEIGHT]]
-    for k in range(weights.shape[-1]):
-        maps[f"weight_{k}"] = TextureMap(
-            weights[..., k : k + 1], ("Y",), "1", f"weight of component {k}"
-        )
-    return maps
+    if variables.SIGMA_TR in fitted:
+        sigma_tr = fitted[variables.SIGMA_TR].values
+        sigma_tr = np.where(sigma_tr > 0, sigma_tr, np.nan)
+        diffuse = fitted[variables.DIFFUSE_REFLECTANCE].values
+        eta = float(fitted[variables.REFRACTIVE_INDEX])
+        path = mean_free_path(diffuse, sigma_tr, eta=eta).astype(np.float32)
+        for c, channel in enumerate(RGB):
+            columns[f"translucency{channel}"] = 1 / sigma_tr[:, [c]]
+            columns[f"mean_free_path{channel}"] = path[:, [c]]
+    for name, variable in MEASURED.items():
+        if variable in fitted:
+            columns[name] = fitted[variable].values.reshape(len(shading), -1)
+    return columns
 
 
 def tangent_frames(

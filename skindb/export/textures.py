@@ -12,7 +12,7 @@ import xarray as xr
 from scipy import ndimage
 
 from skindb.export.inputs import chosen_size, required
-from skindb.export.maps import atlas_images, tangent_frames, to_tangent_space
+from skindb.export.maps import Atlas, tangent_frames, to_tangent_space
 from skindb.optics.angles import directions
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.kinds import as_mixture, even_diffuse
@@ -423,9 +423,8 @@ def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
     shape = _shape(fitted, mesh[variables.TRIANGLE].values)
     top = float(max(skin.f0.max(), MIN_F0))
     columns = _columns(skin, trusted, shape, top)
-    images, layout = atlas_images(model, columns, trust, size=chosen_size(model, size))
-    values = np.split(images, np.cumsum([*layout.values()])[:-1], axis=-1)
-    pictures = _textures(dict(zip(layout, values, strict=True)))
+    atlas = Atlas.of(model, chosen_size(model, size))
+    pictures = _textures(atlas.spread_known(columns, trust))
     error["normal_error_degrees"] = _normal_error(pictures["normal"], shape, trusted)
     f0 = (top, max(mean_f0, MIN_F0), reflection)
     return Skin(pictures, shape, *f0, error, of_one_index, of_preview)
