@@ -68,7 +68,7 @@ def maps(uv: np.ndarray, faces: np.ndarray, size: int, channels: int) -> None:
         start = [time.process_time()]
         raster = rasterise_atlas(uv, faces, pixels)
         start.append(time.process_time())
-        image, confidence = atlas_values(values, trust, uv, faces, raster)
+        image, confidence = atlas_values(values, trust, faces, raster)
         start.append(time.process_time())
         push_pull(image, confidence)
         start.append(time.process_time())

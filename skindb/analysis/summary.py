@@ -419,9 +419,7 @@ def common_maps(
         trust = ((codes == TexelStatus.MEASURED) & finite_rows(values)).astype(
             np.float32
         )
-        image, weight = atlas_values(
-            np.nan_to_num(values), trust, uv, triangles, raster
-        )
+        image, weight = atlas_values(np.nan_to_num(values), trust, triangles, raster)
         if name == variables.DIFFUSE_REFLECTANCE:
             coverage[:] = np.where(outside, np.float32(0), weight)
         filled = (

@@ -13,14 +13,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from skindb.errors import input_error
-from skindb.geometry._texture_kernels import (
-    CORNERS,
-    average,
-    interpolate,
-    pull,
-    push,
-    rasterise,
-)
+from skindb.geometry._texture_kernels import interpolate, pull, push, rasterise
 from skindb.geometry.mesh import (
     boundary_loops,
     edge_table,
@@ -436,21 +429,14 @@ def rasterise_atlas(uv: Array, faces: Faces, size: int) -> tuple[Index32, Image]
     """
     face = np.full((size, size), -1, np.int32)
     weight = np.zeros((size, size, 3), np.float32)
-    rasterise(_doubles(uv), _indices(faces), face, weight)
+    rasterise(np.ascontiguousarray(uv, np.float64), _indices(faces), face, weight)
     return face, weight
 
 
 def atlas_values(
-    values: Array,
-    trust: Array,
-    uv: Array,
-    faces: Faces,
-    raster: tuple[Index32, Image],
+    values: Array, trust: Array, faces: Faces, raster: tuple[Index32, Image]
 ) -> tuple[Image, Image]:
-    """Values of the vertices at the texels of a map.
-
-    Values are interpolated linearly at the centre of the texel in triangles larger than
-    a texel, and averaged by area over the texel in smaller triangles.
+    """Values of the vertices, interpolated linearly at the centres of the texels of a map.
 
     Parameters
     ----------
@@ -458,8 +444,8 @@ def atlas_values(
         (v, c); values without trust are not used.
     trust
         (v,) in [0, 1]: weights of the corners in a texel.
-    uv, faces
-        (v, 2) and (f, 3).
+    faces
+        (f, 3).
     raster
         `rasterise_atlas(uv, faces, size)`.
 
@@ -468,37 +454,19 @@ def atlas_values(
     image : ndarray
         (size, size, c); 0 where nothing is known.
     confidence : ndarray
-        (size, size): mean trust in each texel, 0 outside.
+        (size, size): mean trust of the corners, 0 outside.
     """
     face, weight = raster
-    corner = _indices(faces)
-    place = _doubles(uv)
     mixed, trusted = (np.ascontiguousarray(x, np.float32) for x in (values, trust))
     image = np.zeros((*face.shape, values.shape[1]), np.float32)
     confidence: Image = np.zeros(face.shape, np.float32)
-    interpolate(face, weight, corner, trusted, mixed, image, confidence)
-    tiny = _areas(place, corner) * face.size < 1
-    if tiny.any():
-        chosen = (face >= 0) & tiny[face]
-        memory = np.zeros_like(confidence), *np.empty((2, CORNERS, 2)), np.empty(3)
-        average(place, corner, chosen, trusted, mixed, image, confidence, *memory)
+    interpolate(face, weight, _indices(faces), trusted, mixed, image, confidence)
     return image, confidence
 
 
-def _doubles(x: Array) -> Float64:
-    """Convert to one type, so that kernels are compiled once."""
-    return np.ascontiguousarray(x, np.float64)
-
-
 def _indices(faces: Faces) -> Index32:
+    """Convert to one type, so that kernels are compiled once."""
     return np.ascontiguousarray(faces, np.int32)
-
-
-def _areas(uv: Array, faces: Faces) -> Image:
-    a, b, c = np.asarray(uv, np.float32)[faces.T]
-    ab = b - a
-    ac = c - a
-    return np.asarray(np.abs(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]) / 2)
 
 
 def push_pull(image: Array, confidence: Array) -> tuple[Image, Image]:
