@@ -375,6 +375,19 @@ class Environment:
             raise input_error(str(path), rule, fault, cure)
         return cls(values)
 
+    def texels(self) -> tuple[Array, Array]:
+        """Unit directions (n, 3) of the centres of the texels, and radiance times solid angle
+        (n, 3).
+        """
+        height, width, _ = self.radiance.shape
+        polar = np.pi * (np.arange(height)[:, None] + 0.5) / height
+        azimuth = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
+        x = np.sin(polar) * np.sin(azimuth)
+        z = np.sin(polar) * np.cos(azimuth)
+        y = np.broadcast_to(np.cos(polar), x.shape)
+        direction = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+        return direction, self.radiance.reshape(-1, 3) * self._solid_angle[:, None]
+
     def along(self, direction: Array) -> Array:
         """Radiance (n, 3) from unit directions (n, 3)."""
         return np.asarray(self.radiance.reshape(-1, 3)[self._texel(direction)])

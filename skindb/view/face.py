@@ -11,6 +11,7 @@ from typing import Any
 import imagecodecs
 import numpy as np
 import xarray as xr
+from sklearn.cluster import MiniBatchKMeans
 
 from skindb.errors import input_error
 from skindb.geometry.mesh import vertex_areas
@@ -25,7 +26,7 @@ from skindb.render.surfels import surfel_confidence, with_matt_surfels
 from skindb.schema import variables
 from skindb.schema.consent import honour_consent
 from skindb.schema.notes import Omission
-from skindb.types import AnyArray, Array, Faces, Float32, Half, float64, lengths
+from skindb.types import AnyArray, Array, Faces, Float32, Half, float64, lengths, unit
 
 COUNT = 256  # lights, in 64 passes of four
 SKY_ROWS = 32  # rows of the image of the default sky
@@ -78,12 +79,8 @@ def overcast_sky() -> Environment:
 
 
 def distant_lights(environment: Environment, count: int = COUNT) -> DistantLights:
-    """Distant lights that approximate an environment, by the median cut algorithm of
-    Debevec (2005).
-
-    The region of the image with the most light is repeatedly divided across its longer
-    side into two equally bright parts. Every region becomes one light at its centre of
-    brightness.
+    """Distant lights that approximate an environment: clusters of its texels by direction,
+    weighted by their light (k-means), each at its centre of brightness.
 
     Parameters
     ----------
@@ -97,69 +94,16 @@ def distant_lights(environment: Environment, count: int = COUNT) -> DistantLight
     DistantLights
         The sum of their irradiance is that of the environment, in each channel.
     """
-    height, width, _ = environment.radiance.shape
-    polar = np.pi * np.arange(height + 1) / height
-    solid = np.repeat(
-        (np.cos(polar[:-1]) - np.cos(polar[1:]))[:, None] * 2 * np.pi / width,
-        width,
-        axis=1,
-    )
-    energy = environment.radiance * solid[..., None]
+    direction, energy = environment.texels()
     bright = energy @ LUMINANCE
-    regions = [(0, height, 0, width)]
-    while len(regions) < count:
-        totals = [
-            float(bright[a:b, c:d].sum()) if (b - a) * (d - c) > 1 else -1.0
-            for a, b, c, d in regions
-        ]
-        brightest = int(np.argmax(totals))
-        if totals[brightest] <= 0:
-            break
-        regions += _halves(bright, regions.pop(brightest))
-    mean = (polar[:-1] + polar[1:]) / 2
-    azimuth = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
-    towards = np.stack(
-        [
-            np.sin(mean)[:, None] * np.sin(azimuth),
-            np.repeat(np.cos(mean)[:, None], width, axis=1),
-            np.sin(mean)[:, None] * np.cos(azimuth),
-        ],
-        axis=-1,
-    )
-    lit = [
-        region
-        for region in regions
-        if bright[region[0] : region[1], region[2] : region[3]].sum() > 0
-    ]
-    direction = np.array(
-        [
-            (bright[a:b, c:d, None] * towards[a:b, c:d]).sum(axis=(0, 1))
-            for a, b, c, d in lit
-        ]
-    )
-    direction /= lengths(direction)[..., None]
-    irradiance = np.array([energy[a:b, c:d].sum(axis=(0, 1)) for a, b, c, d in lit])
-    # so that the first lights already come from all directions
-    order = np.random.default_rng(0).permutation(len(lit))
-    return DistantLights(direction[order], irradiance[order])
-
-
-def _halves(
-    bright: Array, region: tuple[int, int, int, int]
-) -> list[tuple[int, int, int, int]]:
-    """A region (rows a to b, columns c to d), divided into two parts of equal brightness."""
-    a, b, c, d = region
-    part = bright[a:b, c:d]
-    across = np.pi * ((a + b) / 2) / bright.shape[0]
-    high = (b - a) / bright.shape[0]
-    wide = 2 * (d - c) / bright.shape[1] * np.sin(across)
-    if b - a > 1 and (high >= wide or d - c == 1):
-        rising = np.cumsum(part.sum(axis=1))
-        cut = a + 1 + min(int(np.searchsorted(rising, rising[-1] / 2)), b - a - 2)
-        return [(a, cut, c, d), (cut, b, c, d)]
-    rising = np.cumsum(part.sum(axis=0))
-    cut = c + 1 + min(int(np.searchsorted(rising, rising[-1] / 2)), d - c - 2)
-    return [(a, b, c, cut), (a, b, cut, d)]
+    lit = bright > 0
+    clusters = MiniBatchKMeans(min(count, int(lit.sum())), random_state=0)
+    clusters.fit(direction[lit], sample_weight=bright[lit])
+    found, label = np.unique(clusters.labels_, return_inverse=True)
+    sums = np.zeros((len(found), 6))
+    moments = direction[lit] * bright[lit, None]
+    np.add.at(sums, label, np.concatenate([moments, energy[lit]], axis=1))
+    return DistantLights(unit(sums[:, :3]), sums[:, 3:])
 
 
 @dataclass(frozen=True)
