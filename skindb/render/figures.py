@@ -11,6 +11,7 @@ import xarray as xr
 
 from skindb.errors import input_error
 from skindb.files import private_file
+from skindb.geometry.mesh import face_crosses
 from skindb.geometry.rays import RayScene
 from skindb.render.image import encode_srgb
 from skindb.schema import variables
@@ -29,8 +30,6 @@ TURNS = (0.0, 55.0)  # degrees to the subject's left
 RANGE = (1, 99)
 UNKNOWN = (0.72, 0.72, 0.72)  # colour of surfels without a value
 MARGIN = 0.03  # border around the head, as a fraction of the longer side
-# shorter side over the longer one; the views of a flat patch may be edge on
-MIN_ASPECT = 0.05
 DPI = 90
 RAY_START_MM = 10.0  # in front of the head
 CELL = 2.0  # inches, the longer side of a picture
@@ -240,55 +239,39 @@ def trace_front(
     turn
         Angle [degrees] by which the view is rotated to the subject's left (+x).
     size
-        Pixels along the longer side of the picture.
+        Pixels along each side of the picture.
 
     Returns
     -------
     corner : ndarray
-        (rows, columns, 3) vertices of the triangle hit; -1 where there is none.
+        (size, size, 3) vertices of the triangle hit; -1 where there is none.
     weight : ndarray
-        (rows, columns, 3) barycentric weights of the corners.
+        (size, size, 3) barycentric weights of the corners.
     shade : ndarray
-        (rows, columns) cosine between the triangle's normal and the direction to the
+        (size, size) cosine between the triangle's normal and the direction to the
         viewer; NaN where there is no hit.
     """
     c = np.cos(np.radians(turn))
     s = np.sin(np.radians(turn))
-    # rightwards in the picture; towards the viewer
-    right = np.array([c, 0, -s])
-    back = np.array([s, 0, c])
-    vertices = position[np.unique(triangle)].astype(np.float64)
-    place = np.column_stack([vertices @ right, vertices[:, 1], vertices @ back])
-    (low_x, bottom, _), (high_x, top, front) = place.min(axis=0), place.max(axis=0)
-    width, height = (
-        max(extent, MIN_ASPECT * max(high_x - low_x, top - bottom))
-        for extent in (high_x - low_x, top - bottom)
-    )
-    edge = MARGIN * max(width, height)
-    step = (max(width, height) + 2 * edge) / size
-    x = (
-        (low_x + high_x - width) / 2
-        - edge
-        + (np.arange(np.ceil((width + 2 * edge) / step)) + 0.5) * step
-    )
-    y = (
-        (top + bottom + height) / 2
-        + edge
-        - (np.arange(np.ceil((height + 2 * edge) / step)) + 0.5) * step
-    )
-    origin = (
-        x[None, :, None] * right
-        + y[:, None, None] * np.array([0.0, 1, 0])
-        + (front + RAY_START_MM) * back
-    )
+    # rightwards in the picture, upwards, and towards the viewer
+    axes = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
+    place = position[np.unique(triangle)].astype(np.float64) @ axes.T
+    low = place.min(axis=0)
+    high = place.max(axis=0)
+    side = (1 + 2 * MARGIN) * (high - low)[:2].max()
+    along = ((np.arange(size) + 0.5) / size - 0.5) * side
+    x, y = np.meshgrid(along, -along)
+    middle = (low + high) / 2
+    depth = np.full(x.shape, high[2] + RAY_START_MM - middle[2])
+    origin = (middle + np.stack([x, y, depth], axis=-1)) @ axes
+    back = axes[2]
     face, weight, _ = RayScene(position, triangle).first_hit(
         origin.reshape(-1, 3), -back[None]
     )
     corner = np.where(face[:, None] >= 0, triangle[face], -1)
-    p, q, r = (position[corner[:, k]] for k in range(3))
-    normal = np.cross(q - p, r - p)
+    normal = face_crosses(position, corner)
     shade = np.abs(normal @ back) / np.maximum(lengths(normal), 1e-30)
-    shape = (len(y), len(x))
+    shape = (size, size)
     return (
         corner.reshape(*shape, 3),
         weight.reshape(*shape, 3),

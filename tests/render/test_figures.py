@@ -83,7 +83,7 @@ def test_trace_front__a_plate_in_parallel_rays(plate, turn):
     longer = max(40, 80 * np.cos(np.radians(turn)))
     pixel = longer * 1.06 / 200
     np.testing.assert_allclose(
-        met[:, 1], 20 + 0.03 * longer - (rows + 0.5) * pixel, atol=1e-4
+        met[:, 1], 0.53 * longer - (rows + 0.5) * pixel, atol=1e-4
     )
     np.testing.assert_allclose(np.diff(across), np.diff(columns) * pixel, atol=1e-4)
     # the whole plate is in the picture, and nothing else
@@ -96,8 +96,7 @@ def test_trace_front__a_plate_seen_edge_on_has_a_picture_all_the_same(plate):
     position, triangle = plate
     for turned in (position[:, [0, 2, 1]], position[:, [2, 1, 0]] * [1, 1e-3, 1]):
         _, _, shade = trace_front(turned, triangle, size=100)
-        assert max(shade.shape) == 100
-        assert min(shade.shape) == 11  # a twentieth of the longer side, and the margins
+        assert shade.shape == (100, 100)
 
 
 def test_field_figure__colours_say_the_value_and_the_scale_its_unit(take):
