@@ -11,7 +11,7 @@ from typing import Any
 import imagecodecs
 import numpy as np
 import xarray as xr
-from sklearn.cluster import MiniBatchKMeans
+from sklearn.cluster import KMeans
 
 from skindb.errors import input_error
 from skindb.geometry.mesh import vertex_areas
@@ -29,6 +29,8 @@ from skindb.schema.notes import Omission
 from skindb.types import AnyArray, Array, Faces, Float32, Half, float64, lengths, unit
 
 COUNT = 256  # lights, in 64 passes of four
+MAX_TEXELS = 10_000  # of an environment, of which clusters are made
+ROUNDS = 20  # of clustering
 SKY_ROWS = 32  # rows of the image of the default sky
 GROUND = 0.2  # radiance below the horizon, relative to that of the zenith
 MAX_STILL_SIDE = 640  # px; a picture of a camera of 4 megapixels took 6 GB and minutes
@@ -97,11 +99,18 @@ def distant_lights(environment: Environment, count: int = COUNT) -> DistantLight
     direction, energy = environment.texels()
     bright = energy @ LUMINANCE
     lit = bright > 0
-    clusters = MiniBatchKMeans(min(count, int(lit.sum())), random_state=0)
-    clusters.fit(direction[lit], sample_weight=bright[lit])
-    found, label = np.unique(clusters.labels_, return_inverse=True)
+    points = direction[lit]
+    weight = bright[lit]
+    chosen = np.arange(len(points))
+    if len(points) > MAX_TEXELS:  # drawn by their light instead of weighted by it
+        rng = np.random.default_rng(0)
+        chosen = rng.choice(len(points), MAX_TEXELS, p=weight / weight.sum())
+        weight = np.ones(len(points))
+    clusters = KMeans(min(count, len(points)), random_state=0, max_iter=ROUNDS)
+    clusters.fit(points[chosen], sample_weight=weight[chosen])
+    found, label = np.unique(clusters.predict(points), return_inverse=True)
     sums = np.zeros((len(found), 6))
-    moments = direction[lit] * bright[lit, None]
+    moments = points * bright[lit, None]
     np.add.at(sums, label, np.concatenate([moments, energy[lit]], axis=1))
     return DistantLights(unit(sums[:, :3]), sums[:, 3:])
 

@@ -108,7 +108,7 @@ def test_field_figure__colours_say_the_value_and_the_scale_its_unit(take):
         np.percentile(take["fitted/surfel_area"], (1, 99)), rel=0.05
     )
     bright = image[:, image.shape[1] // 2].sum(axis=-1)
-    middle = bright[20:-20]
+    middle = bright[bright < 3][20:-20]  # without the white above and below
     # y falls from the top; viridis is darkest at the least
     assert middle[5] > middle[len(middle) // 2] > middle[-5]
 
