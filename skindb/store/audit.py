@@ -20,7 +20,6 @@ from typing import Any
 
 from skindb import __version__
 from skindb.errors import Fault, InputError, input_error
-from skindb.store.condition import evaluate
 from skindb.store.markers import is_sealed, keyed_hash, keyed_seal, require_secret
 from skindb.store.place import AUDIT, Place, UnavailableError, subject_of
 from skindb.store.record import collect_faults, damage_as_fault, json_object
@@ -135,7 +134,7 @@ def append_entry(
 
 
 def read_audit(
-    place: Place, *, subject: str | None = None, where: str | None = None
+    place: Place, *, subject: str | None = None
 ) -> tuple[list[AuditEntry], list[Fault]]:
     """The readable entries, oldest first, and the faults of the whole log.
 
@@ -145,9 +144,6 @@ def read_audit(
         Location of the database.
     subject
         Pseudonym, for the entries that concern this subject only.
-    where
-        Condition, see `skindb.store.condition`, on number, when, actor, action and
-        subjects, which is their number.
     """
     file_type = place.file_type(AUDIT)
     if not file_type:
@@ -173,12 +169,6 @@ def read_audit(
     if subject is not None:
         name = keyed_hash(secret, subject)
         selected = [entry for entry in selected if name in entry.subjects]
-    if where is not None:
-        selected = [
-            entry
-            for entry, is_true in zip(selected, _truth(where, selected), strict=True)
-            if is_true
-        ]
     return selected, faults
 
 
@@ -293,16 +283,3 @@ def _chain_faults(
                 "an entry that names a different predecessor",
                 RESTORE,
             )
-
-
-def _truth(where: str, entries: list[AuditEntry]) -> list[bool | None]:
-    columns: dict[str, list[Any]] = {
-        "number": [entry.number for entry in entries],
-        "when": [
-            datetime.fromisoformat(entry.when).replace(tzinfo=None) for entry in entries
-        ],
-        "actor": [entry.actor for entry in entries],
-        "action": [entry.action for entry in entries],
-        "subjects": [len(entry.subjects) for entry in entries],
-    }
-    return evaluate(where, columns)[0]

@@ -214,16 +214,6 @@ class Bucket:
         """The identity of every object below a key, by its path relative to the key."""
         return {path: _identity(meta) for path, meta in self._objects(key).items()}
 
-    def proves(self, identity: tuple[Hashable, ...], content: bytes) -> bool:
-        """Whether an identity shows that the object has this content: the entity tag of
-        a plain object is its MD5.
-        """
-        size, tag, *_ = *identity, None, None
-        return (
-            size == len(content)
-            and tag == f'"{hashlib.md5(content, usedforsecurity=False).hexdigest()}"'
-        )
-
     def modified(self, key: str) -> float:
         """Time in seconds, by the clock of the bucket, when an object or the newest
         object below a key was written.

@@ -604,7 +604,7 @@ class Database:
         append_entry(self.place, action, **about)
 
     def audit(
-        self, *, subject: str | None = None, where: str | None = None
+        self, *, subject: str | None = None
     ) -> tuple[list[AuditEntry], list[Fault]]:
         """The entries of the audit log, oldest first, and the faults of the whole log.
 
@@ -612,11 +612,8 @@ class Database:
         ----------
         subject
             Pseudonym, to list only what concerns this subject.
-        where
-            Condition, as in `takes`, on number, when, actor, action and subjects, which
-            is their number.
         """
-        return read_audit(self.place, subject=subject, where=where)
+        return read_audit(self.place, subject=subject)
 
     def verify(self) -> list[Fault]:
         """Check every record and every file of every version, and return all faults."""

@@ -23,8 +23,6 @@ from skindb.store.place import Place, in_parallel
 from skindb.store.record import Key, Record, intact_or_none
 
 CATALOGUE = "catalogue"
-# of databases that were made before the first release; names every subject
-EARLIER_CATALOGUE = "catalogue.json"
 CATALOGUE_BLOCK = r"[0-9a-f]{64}\.json"
 BLOCK_FORMAT = 6
 # a withdrawal removes the blocks with its subject, whose other rows are read again
@@ -146,8 +144,6 @@ def catalogue_blocks_of(place: Place, is_named: Callable[[str], bool]) -> list[s
     is true.
     """
     blocks = read_cache(place, CATALOGUE, partial(_read_block, place))
-    if place.file_type(EARLIER_CATALOGUE) == "file":
-        blocks[EARLIER_CATALOGUE] = None
     return [
         key
         for key, entries in blocks.items()

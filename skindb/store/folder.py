@@ -139,10 +139,6 @@ class Folder:
         place = inside(self.root, key)
         return {**_walk(place)} if place.is_dir() else {}
 
-    def proves(self, identity: tuple[Hashable, ...], content: bytes) -> bool:  # noqa: ARG002
-        """False: the identity of a local file does not show its content."""
-        return False
-
     def modified(self, key: str) -> float:
         """Time in seconds, by the clock of the storage, when a file or the newest file
         below a key was written.

@@ -11,7 +11,7 @@ missing or outdated, but if it is intact and ahead of the log, a record was lost
 import hashlib
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -68,34 +68,6 @@ class Log:
         # a link in place of a record is not hidden
         names = self.place.children(self.key, links=True)
         return [int(m[1]) for name in names if (m := GENERATION.fullmatch(name))]
-
-    def read_listed(
-        self, listed: list[int], is_head: Callable[[bytes], bool]
-    ) -> Record:
-        """The current record, given the generations that were listed already.
-
-        Parameters
-        ----------
-        listed
-            Generations, ascending.
-        is_head
-            Whether the head is known to have this content; if not, the head is read.
-
-        Raises
-        ------
-        InputError
-            If the head names another record. A list that is older than a commit of
-            another run looks like a lost record; the caller should then use `read`.
-        """
-        record = self._read(listed[-1])
-        if is_head(self.head_content(record.generation, record.seal)):
-            return record
-        head = self.head()
-        if fault := self._lost_fault(head, listed) or self._mismatch_fault(
-            head, record
-        ):
-            raise InputError(fault)
-        return record
 
     def read(self, generation: int | None = None) -> Record:
         """A record, by default the current one; the `InputError` for a missing one

@@ -228,11 +228,6 @@ class Place(Protocol):
         written or replaced, by its path relative to the key; (-1,) if not a regular file.
         """
 
-    def proves(self, identity: tuple[Hashable, ...], content: bytes) -> bool:
-        """Whether an identity from `identities` proves, without reading the file, that
-        it has exactly this content.
-        """
-
     def modified(self, key: str) -> float:
         """Time in seconds, by the clock of the storage, when a file or the newest file
         below a key was written.

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import configparser
 import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from skindb.errors import Fault, input_error
@@ -33,12 +32,8 @@ FIRST_PAUSE = timedelta(seconds=0.1)
 LONGEST_PAUSE = timedelta(seconds=10)
 PAUSE_GROWTH = 2
 ENDPOINTS = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT")
-KEYS = {
-    "access_key_id": "aws_access_key_id",
-    "secret_access_key": "aws_secret_access_key",
-}
-# environment variables for credentials; other sources are a profile and the metadata
-# service of AWS machines
+# environment variables for credentials; another source is the metadata service of AWS
+# machines
 SOURCES = (
     "AWS_ACCESS_KEY_ID",
     "AWS_WEB_IDENTITY_TOKEN_FILE",
@@ -50,7 +45,7 @@ SOURCES = (
 VENDOR = Path("/sys/class/dmi/id/sys_vendor")
 _OBSTORE_PROCESS: list[int] = []  # id of the process that owns the threads of obstore
 CURE_PERMISSION = "check AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and their permissions"
-CURE_NO_KEYS = "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE"
+CURE_NO_KEYS = "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
 CURE_NETWORK = "check AWS_ENDPOINT_URL and the network, then run the command again"
 
 
@@ -89,8 +84,7 @@ def bucket_and_prefix(url: str) -> tuple[str, str]:
 def connect(bucket: str, prefix: str) -> S3Store:
     """Store of a bucket below a prefix, without sending a request.
 
-    Address and credentials are taken from the environment, or else from the profile of
-    the AWS command line.
+    Address and credentials are taken from the environment.
 
     Raises
     ------
@@ -107,20 +101,11 @@ def connect(bucket: str, prefix: str) -> S3Store:
             "it is not installed",
             "pip install 'skindb[s3]'",
         ) from None
-    settings: dict[str, Any] = {"endpoint": endpoint()} if endpoint() else {}
-    if (
-        not {"AWS_REGION", "AWS_DEFAULT_REGION"} & os.environ.keys()
-        and "region" in _profile()
-    ):
-        settings["region"] = _profile()["region"]
-    if not set(SOURCES) & os.environ.keys():
-        if set(KEYS.values()) <= _profile().keys():
-            settings["credential_provider"] = _profile_credentials
-        elif not _is_on_aws():
-            # without the metadata service of AWS the request times out after a minute
-            raise input_error(
-                f"s3://{bucket}", "credentials must be set", "none", CURE_NO_KEYS
-            )
+    if not set(SOURCES) & os.environ.keys() and not _is_on_aws():
+        # without the metadata service of AWS the request times out after a minute
+        raise input_error(
+            f"s3://{bucket}", "credentials must be set", "none", CURE_NO_KEYS
+        )
     pauses: BackoffConfig = {
         "init_backoff": FIRST_PAUSE,
         "max_backoff": LONGEST_PAUSE,
@@ -140,7 +125,7 @@ def connect(bucket: str, prefix: str) -> S3Store:
                 "retry_timeout": RETRY_TIMEOUT,
                 "backoff": pauses,
             },
-            **settings,
+            endpoint=endpoint() or None,
         )
     except (BaseError, ValueError, TypeError):
         # the text of the error may contain secret values of variables
@@ -158,10 +143,7 @@ def endpoint() -> str:
     InputError
         If it is not a valid URL, or if data of subjects would be sent unencrypted over a network.
     """
-    address = next(
-        (os.environ[name] for name in ENDPOINTS if os.environ.get(name)),
-        _profile().get("endpoint_url", ""),
-    )
+    address = next((os.environ[name] for name in ENDPOINTS if os.environ.get(name)), "")
     if not address:
         return ""
     parts = urlsplit(address)
@@ -275,53 +257,8 @@ def _fault(location: str, rule: str, finding: str, cure: str) -> UnavailableErro
     return UnavailableError(Fault(location, rule, finding, cure))
 
 
-def _profile() -> dict[str, str]:
-    """Settings of the profile AWS_PROFILE, by default "default", from the files of the
-    AWS command line.
-    """
-    name = os.environ.get("AWS_PROFILE", "")
-    home = Path.home() / ".aws"
-    section = f"profile {name}" if name and name != "default" else "default"
-    files = {
-        Path(os.environ.get("AWS_CONFIG_FILE") or home / "config"): section,
-        Path(
-            os.environ.get("AWS_SHARED_CREDENTIALS_FILE") or home / "credentials"
-        ): name or "default",
-    }
-    settings: dict[str, str] = {}
-    for path, title in files.items():
-        parser = configparser.ConfigParser(
-            interpolation=None, default_section="no defaults"
-        )
-        try:
-            parser.read(path, encoding="utf-8")
-        except (configparser.Error, UnicodeDecodeError):
-            # the text of the error repeats lines of the file
-            raise input_error(
-                str(path),
-                "must be a configuration file of the AWS command line",
-                "lines that cannot be parsed",
-                "correct it",
-            ) from None
-        settings |= dict(parser[title]) if title in parser else {}
-    if name and not settings:
-        raise input_error(
-            "AWS_PROFILE",
-            "must name a profile of the AWS configuration",
-            repr(name),
-            "correct it, or unset it",
-        )
-    return settings
-
-
 def _is_on_aws() -> bool:
     try:
         return VENDOR.read_text(encoding="utf-8").startswith("Amazon")
     except (OSError, UnicodeDecodeError):
         return False
-
-
-def _profile_credentials() -> Any:
-    profile = _profile()
-    keys = {name: profile[key] for name, key in KEYS.items()}
-    return keys | {"token": profile.get("aws_session_token"), "expires_at": None}

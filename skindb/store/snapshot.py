@@ -35,7 +35,6 @@ from skindb.store.place import (
     TRANSIENT,
     Located,
     Place,
-    UnavailableError,
     in_parallel,
     require_text,
     subject_of,
@@ -325,9 +324,6 @@ class RecordCache:
         self._heads = heads.result()
         self._markers = markers.result()
         self.snapshot = Snapshot(place, self._markers)
-        self._head_texts = {
-            key: identity_text(identity) for key, identity in self._heads.items()
-        }
         self._entries: dict[Key, Entry] = {}
         # key of each block -> its entries that are still valid; none if it is damaged
         self._blocks = {
@@ -350,7 +346,7 @@ class RecordCache:
             key = entry.record.key
             if self._files.get(key) == entry.file:
                 added.append(key)
-                head = self._head_texts.get(key[:2], "")
+                head = self._heads.get(key[:2], "")
                 if key not in self._entries or entry.head == head:
                     self._entries[key] = entry
         return added
@@ -439,38 +435,18 @@ class RecordCache:
         number = generation if generation is not None or not listed else listed[-1]
         entry = None if number is None else self._entries.get((kind, take, number))
         is_checked = generation is not None or (
-            entry is not None and entry.head == self._head_texts.get((kind, take), "")
+            entry is not None and entry.head == self._heads.get((kind, take), "")
         )
         return entry if is_checked else None
 
     def _read(self, kind: str, take: str, generation: int | None) -> Record:
         """A record from the log, with the checks of `Log.read`."""
-        log = Log(self.place, kind, take)
-        listed = self._generations.get((kind, take), [])
-        head = self._heads.get((kind, take), ())
-        try:
-            if generation is None and listed:
-                record = log.read_listed(
-                    listed, lambda content: self.place.proves(head, content)
-                )
-            else:
-                record = log.read(generation)
-        except UnavailableError:
-            raise
-        except InputError:
-            # damaged, or committed or removed since the listing, which the log decides
-            record = self.snapshot.record(kind, take, generation)
-        if not self._markers.admits(record):
-            # raises the reason
-            return self.snapshot.record(kind, take, generation)
+        record = self.snapshot.record(kind, take, generation)
         record = trimmed_record(record)
         key = record.key
         if key in self._files:
-            self._entries[key] = Entry(
-                record,
-                self._files[key],
-                self._head_texts.get((kind, take), "") if generation is None else None,
-            )
+            head = self._heads.get(key[:2], "") if generation is None else None
+            self._entries[key] = Entry(record, self._files[key], head)
             self._new.add(key)
         return record
 
@@ -491,7 +467,7 @@ def require_same_markers(place: Place, markers: Markers, key: str) -> None:
         )
 
 
-def _list_heads(place: Place) -> dict[tuple[str, str], tuple[Hashable, ...]]:
+def _list_heads(place: Place) -> dict[tuple[str, str], str]:
     """Identity of every head, by kind and take; empty if the folder of heads is damaged."""
     # a link in place of the folder is damage
     identities = intact_or_none(partial(place.identities, "heads")) or {}
@@ -500,4 +476,7 @@ def _list_heads(place: Place) -> dict[tuple[str, str], tuple[Hashable, ...]]:
         for name in identities
         if name.endswith(".json")
     }
-    return {(kind, take): identities[name] for name, (kind, _, take) in parts.items()}
+    return {
+        (kind, take): identity_text(identities[name])
+        for name, (kind, _, take) in parts.items()
+    }

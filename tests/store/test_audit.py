@@ -208,16 +208,10 @@ def test_append_entry__continues_in_the_block_before_an_empty_one(db):
     assert _file(db, 6).exists()
 
 
-def test_read_audit__selects_by_subject_and_condition(db):
+def test_read_audit__selects_by_subject(db):
     numbers = [entry.number for entry in db.audit(subject="S01")[0]]
     assert numbers == [1, 2, 4]
     assert db.audit(subject="S0")[0] == db.audit(subject="")[0] == []
-    assert [
-        entry.number for entry in db.audit(where="number > 3 and action == 'export'")[0]
-    ] == [4, 5]
-    assert db.audit(where="when < '2020-01-01'")[0] == []
-    with pytest.raises(InputError, match="actor"):
-        db.audit(where="aktor == 'anna'")
 
 
 def test_read_audit__of_a_database_without_a_log_is_empty_and_writes_nothing(tmp_path):

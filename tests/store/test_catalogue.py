@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import shutil
-from pathlib import PurePosixPath
 
 import pandas as pd
 import pytest
@@ -148,38 +147,6 @@ def test_table__of_a_bucket_needs_as_many_requests_for_many_takes_as_for_few(
             counts.append(len(proxy.requests))
     # the log, the heads, the withdrawals, the list of blocks of the cache, and one block
     assert counts == [5, 5, 5, 5]
-
-
-def test_table__the_first_of_a_bucket_reads_one_object_for_each_record(
-    bucket, monkeypatch
-):
-    for take in ("A1", "B2", "C3"):
-        commit(bucket, take=take, **SCOPE)
-    with faulty_proxy(os.environ["AWS_ENDPOINT_URL"]) as proxy:
-        monkeypatch.setenv("AWS_ENDPOINT_URL", proxy.address)
-        skindb.open(bucket).table()
-        methods = [method for method, path in proxy.requests if "/log/" in path]
-        names = sorted(
-            PurePosixPath(path).parts[-2]
-            for method, path in proxy.requests
-            if "/log/" in path
-        )
-    assert (methods, names) == (["GET"] * 3, ["A1", "B2", "C3"])
-    assert not [path for _, path in proxy.requests if "/heads/" in path]
-
-
-def test_table__a_head_in_a_bucket_that_names_another_record_is_read(bucket):
-    commit(bucket, take="A1", **SCOPE)
-    db = skindb.open(bucket)
-    log = Log(db.place, "capture", "A1")
-    for seal in ("0" * 64, "1" * 63 + "0"):
-        db.place.replace(log.head_key, log.head_content(1, seal))
-        with pytest.raises(
-            InputError, match="generation 1 must be the record that was committed"
-        ):
-            db.table()
-    log._write_head(1, log._read(1).seal)
-    assert list(skindb.open(bucket).table().index) == ["A1"]
 
 
 @pytest.mark.parametrize("is_seen", [True, False])

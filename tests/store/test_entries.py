@@ -86,19 +86,6 @@ def test_save__foreign_files_are_left_to_verify(db):
     assert not foreign.exists()
 
 
-def test_erase__removes_the_catalogue_of_an_earlier_commit(db):
-    file = db.root / "catalogue.json"
-    file.write_text('{"B2": 1}')
-    erase(db.place, "B2")
-    assert not file.exists()
-    # comes back, for example from a copy
-    file.write_text('{"B2": 1}')
-    assert ["catalogue.json" in str(fault) for fault in db.verify()] == [True]
-    db.clean()
-    assert not file.exists()
-    assert db.verify() == []
-
-
 def test_read_blocks__that_another_query_merges_meanwhile(db):
     db.table()
     [key] = entries.block_keys(db.place, "catalogue")

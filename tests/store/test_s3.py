@@ -77,47 +77,6 @@ def test_connect__without_credentials_fails_at_once(monkeypatch, tmp_path):
         Database("s3://faces/x")
 
 
-def test_connect__takes_a_profile(new_database, monkeypatch, tmp_path):
-    url = new_database("localbucket")
-    address = os.environ["AWS_ENDPOINT_URL"]
-    for name in (
-        "AWS_ENDPOINT_URL",
-        "AWS_ACCESS_KEY_ID",
-        "AWS_SECRET_ACCESS_KEY",
-        "AWS_REGION",
-    ):
-        monkeypatch.delenv(name)
-    monkeypatch.setenv("AWS_CONFIG_FILE", str(tmp_path / "config"))
-    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(tmp_path / "credentials"))
-    (tmp_path / "config").write_text(
-        f"[profile lab]\nregion = eu-central-1\nendpoint_url = {address}\n"
-    )
-    (tmp_path / "credentials").write_text(
-        f"[lab]\naws_access_key_id = {KEY}\naws_secret_access_key = {SECRET}\n"
-    )
-    monkeypatch.setenv("AWS_PROFILE", "lab")
-    with faulty_proxy(address) as proxy:
-        monkeypatch.setattr(s3, "endpoint", lambda: proxy.address)
-        commit(url)
-        signed = proxy.headers["authorization"]
-    assert f"Credential={KEY}/" in signed
-    assert "/eu-central-1/s3/" in signed
-    assert SECRET not in signed
-    monkeypatch.undo()
-    monkeypatch.setenv("AWS_PROFILE", "nobody")
-    with pytest.raises(InputError, match="AWS_PROFILE: must name a profile"):
-        Database(url)
-
-
-def test_connect__a_damaged_profile_is_not_repeated(monkeypatch, tmp_path):
-    (tmp_path / "credentials").write_text(f"aws_secret_access_key = {SECRET}\n")
-    with pytest.raises(
-        InputError, match="must be a configuration file of the AWS command line"
-    ) as caught:
-        Database("s3://faces/x")
-    assert SECRET not in str(caught.value)
-
-
 @pytest.mark.parametrize(
     ("address", "rule"),
     [
