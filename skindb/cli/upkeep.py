@@ -384,7 +384,7 @@ def restore(
     """Restore the database of BACKUP to DB, a folder or a bucket that is empty or missing.
 
     Withdrawals and consents that came after the backup are repeated from the marker
-    file. An interrupted restore is continued by the same command, and until then every
+    file. After an interrupted restore the same command begins again, and until then every
     other command refuses DB.
     """
     if only_list:

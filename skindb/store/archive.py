@@ -286,7 +286,7 @@ class Archive:
     def version_items(self, record: Record) -> list[Item]:
         """All files of a version except for its record; `InputError` if its manifest is damaged."""
         beside = (record.beside("manifest"), record.manifest, None)
-        return [beside, *items_of(record, self._parsed(beside, manifest_from_json))]
+        return items_of(record, self._parsed(beside, manifest_from_json))
 
     def uses(self, state: State, seen: set[str], faults: list[Fault]) -> list[Item]:
         """Every content that a state needs.
@@ -375,15 +375,13 @@ def content_key(digest: str) -> str:
 
 
 def items_of(record: Record, manifest: Manifest) -> list[Item]:
-    """The files of a version that its manifest lists, and its tables."""
-    items = [
-        (f"{record.path}/{name}", file.digests.whole, file.size)
-        for name, file in manifest.items()
-    ]
-    return [
-        *items,
-        *([(record.beside("tables"), record.tables, None)] if record.tables else []),
-    ]
+    """All files of a version except for its record."""
+    items: list[Item] = [(record.beside("manifest"), record.manifest, None)]
+    for name, file in manifest.items():
+        items.append((f"{record.path}/{name}", file.digests.whole, file.size))
+    if record.tables:
+        items.append((record.beside("tables"), record.tables, None))
+    return items
 
 
 def seal_of_withdrawals(markers: Markers) -> str:
@@ -408,21 +406,17 @@ def surviving(
     markers
         Withdrawals.
     """
-    removed = {*tombstones}
+    tombstoned = {*tombstones}
     present = {
         key: record
         for key, record in records.items()
-        if tombstone_of(record.seal) not in removed
+        if tombstone_of(record.seal) not in tombstoned
     }
-    remainder = remainder_of(present.values(), requests, markers)
-    seals = {record.seal for record in remainder.records}
-    additions = {
-        request.key: request_content(request) for request in remainder.requests
-    }
-    additions |= {
-        tombstone_of(record.seal): tombstone_content(record)
-        for record in remainder.removed
-    }
+    remaining, removed, needed = remainder_of(present.values(), requests, markers)
+    seals = {record.seal for record in remaining}
+    additions = {request.key: request_content(request) for request in needed}
+    for record in removed:
+        additions[tombstone_of(record.seal)] = tombstone_content(record)
     return {
         key: record for key, record in present.items() if record.seal in seals
     }, additions

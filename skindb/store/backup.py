@@ -55,8 +55,6 @@ MAX_LISTS = 100
 MAX_ATTEMPTS = 20
 # requests first, because they can appear and vanish again
 LISTED = (REQUESTS, WITHDRAWN, "log", "tombstones", "audit")
-# files whose names always have the same content
-NEVER_CHANGE = ("audit/", "tombstones/")
 Listing = dict[str, Hashable]  # key of a file -> identity
 
 
@@ -205,7 +203,7 @@ def _write_state(place: Place, archive: Archive, lease: Lease) -> BackupReport:
     guard = archive.guard(markers)
     contents = archive.contents()
     states, faults = _erased_states(archive, markers)
-    draft = _draft(place, markers, states)
+    draft = _draft(place, markers)
     note_withdrawals(place)
     note_consents(
         place, [record for record in draft.records.values() if record.kind == CONSENT]
@@ -294,7 +292,7 @@ def _erased_states(
     return states, faults
 
 
-def _draft(place: Place, markers: Markers, states: list[State]) -> Draft:
+def _draft(place: Place, markers: Markers) -> Draft:
     """The state of a database at one moment, without withdrawn subjects."""
     listing = _list_twice(place)
     keys = [
@@ -312,33 +310,25 @@ def _draft(place: Place, markers: Markers, states: list[State]) -> Draft:
         markers,
     )
     files = {key: readable[key][1] for key in records}
-    previous = states[-1].files if states else {}
-    names = [
+    small_files = [
         record.beside("names")
         for record in records.values()
         if record.kind not in KINDS_OF_ONE_SUBJECT
     ]
-    small_files = [
+    small_files += [
         key
         for key in listing
-        if key.startswith(NEVER_CHANGE) and STATE_KEY.fullmatch(key)
+        if key.startswith(("audit/", "tombstones/")) and STATE_KEY.fullmatch(key)
     ]
-    files |= {key: previous[key] for key in small_files if key in previous}
     items: list[Item] = []
-    files |= intact(
-        partial(_digest, place),
-        [*names, *(key for key in small_files if key not in previous)],
-        faults,
-    )
+    files |= intact(partial(_digest, place), small_files, faults)
     for _, those in intact(partial(_version_items, place), records.values(), faults):
         items += those
     items += [(key, digest, None) for key, digest in files.items()]
-    additions = {
-        hashlib.sha256(content).hexdigest(): content for content in texts.values()
-    }
-    files |= {
-        key: hashlib.sha256(content).hexdigest() for key, content in texts.items()
-    }
+    additions = {}
+    for key, content in texts.items():
+        files[key] = hashlib.sha256(content).hexdigest()
+        additions[files[key]] = content
     _require_unchanged(place, listing, markers, faults)
     return Draft(listing, records, files, items, additions, faults)
 
@@ -383,11 +373,7 @@ def _require_unchanged(
 
 
 def _version_items(place: Place, record: Record) -> list[Item]:
-    """All files of a version except for its record."""
-    return [
-        (record.beside("manifest"), record.manifest, None),
-        *items_of(record, read_manifest(place, record)),
-    ]
+    return items_of(record, read_manifest(place, record))
 
 
 def _digest(place: Place, key: str) -> str:

@@ -56,7 +56,6 @@ class CohortRequest:
     layout: Layout
     surfels: int = 2000
     size: int = 512
-    seed: int = 0
     digest: str = ""  # of the code that computed the summary; empty for any
     maps: tuple[str, ...] | None = None  # variables of the maps; by default all
 
@@ -173,7 +172,7 @@ def _stored_records(
     if missing:
         contents = {
             "tables": "tables",
-            "surfels": f"a sample of {request.surfels} surfels with seed {request.seed}",
+            "surfels": f"a sample of {request.surfels} surfels",
             "maps": f"maps of {request.size} texels",
         }
         kind = records[missing[0]].kind
@@ -355,9 +354,7 @@ def _has_data_for(record: Record, request: CohortRequest) -> bool:
         parameters = record.provenance.get("summary_parameters", {})
         # fewer than requested: the sample contains all fitted surfels
         is_complete = count < int(parameters.get("surfels", 0))
-        return int(parameters.get("seed", 0)) == request.seed and (
-            count >= request.surfels or is_complete
-        )
+        return count >= request.surfels or is_complete
     return request.layout == "tables" or (
         contents["sizes"]["u"] == request.size
         and set(request.maps or ()) <= set(contents["variables"])

@@ -11,7 +11,7 @@ import pandas as pd
 import xarray as xr
 
 from skindb.errors import Fault, InputError, input_error, require
-from skindb.schema.consent import CONSENT
+from skindb.schema.consent import CONSENT, require_consent
 from skindb.store.archive import Archive
 from skindb.store.arrays import open_version
 from skindb.store.audit import AuditEntry, append_entry, read_audit
@@ -278,6 +278,10 @@ class Database:
         """
         return list(consent_of(Snapshot(self.place), take))
 
+    def require_consent(self, take: str, scope: str) -> None:
+        """Raise an `InputError` unless the subject of a take consents to this scope."""
+        require_consent({"consent_scope": self.consent(take), "take": take}, scope)
+
     def record_consent(self, subject: str, scope: Iterable[str]) -> Record:
         """Record the consent of a subject, which takes effect immediately for all
         present and future versions.
@@ -317,7 +321,6 @@ class Database:
         dim: str = "take",
         surfels: int = 2000,
         size: int = 512,
-        seed: int = 0,
         release: str | None = None,
     ) -> xr.Dataset:
         """A lazy Dataset of the population with one entry per take.
@@ -343,9 +346,8 @@ class Database:
             statistics are skipped and listed in the attribute "skipped".
         dim
             "take", or "subject" for one take per subject, in the condition normal.
-        surfels, seed
-            Number of surfels of each take, and the random seed of the sample. Models
-            store 5,000 with seed 0.
+        surfels
+            Number of surfels of each take; models store a random sample of 5,000.
         size
             Number of texels along each side of the maps; registrations store 512.
         release
@@ -380,7 +382,7 @@ class Database:
         chosen = None if variables is None else tuple(variables)
         combined = cohort(
             lookup,
-            CohortRequest(layout, surfels, size, seed, maps=chosen),
+            CohortRequest(layout, surfels, size, maps=chosen),
             kind=kind,
             variables=chosen,
             takes=takes,

@@ -144,19 +144,10 @@ def holdings_of(place: Place, markers: Markers) -> Holdings:
     )
 
 
-@dataclass(frozen=True)
-class Remainder:
-    """What an erasure leaves of records and requests."""
-
-    records: list[Record]
-    removed: list[Record]  # those of others, each of which leaves a tombstone
-    requests: list[Request]
-
-
 def remainder_of(
     records: Iterable[Record], requests: Iterable[Request], markers: Markers
-) -> Remainder:
-    """The records and requests that remain if these entries declare subjects withdrawn.
+) -> tuple[list[Record], list[Record], list[Request]]:
+    """What an erasure leaves if these entries declare subjects withdrawn.
 
     Parameters
     ----------
@@ -164,6 +155,12 @@ def remainder_of(
         All records of a database, the newest of each kind and take after the others.
     requests, markers
         Requests and withdrawals of the database.
+
+    Returns
+    -------
+    remaining, removed, requests
+        Records that remain; those of others that are removed, each of which leaves a
+        tombstone; requests.
     """
     listed = list(records)
     removed = _doomed(listed, markers)
@@ -172,20 +169,15 @@ def remainder_of(
     current = [
         record for record in removed if newest[record.kind, record.take] == _key(record)
     ]
-    needed = [
-        *requests,
-        *filter(None, [_replacement(record, gone) for record in current]),
-    ]
+    replacements = (_replacement(record, gone) for record in current)
+    needed = [*requests, *filter(None, replacements)]
     changed = {request.key: request.without(markers.is_withdrawn) for request in needed}
-    return Remainder(
-        [
-            record
-            for record in listed
-            if _key(record) not in gone and not markers.hides(record.kind, record.take)
-        ],
-        removed,
-        [request for request in changed.values() if request is not None],
-    )
+    remaining = [
+        record
+        for record in listed
+        if _key(record) not in gone and not markers.hides(record.kind, record.take)
+    ]
+    return remaining, removed, [*filter(None, changed.values())]
 
 
 def erase(place: Place, subject: str, *, wait: float = 0.0) -> Erasure:

@@ -10,7 +10,6 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from typing import Any, TypeGuard, TypeVar
 
 from skindb.errors import Fault, InputError, input_error
@@ -31,24 +30,13 @@ T = TypeVar("T")
 # what reading or parsing a damaged file raises
 DAMAGE = (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError)
 FORMAT = 4
-FIELDS = {
-    "format",
-    "kind",
-    "take",
-    "generation",
-    "path",
-    "created",
-    "bytes",
-    "provenance",
-    "names",
-    "manifest",
-    "tables",
-    "contents",
-    "previous",
-}
-DIGEST = re.compile("[0-9a-f]{64}")
+DIGEST = "[0-9a-f]{64}"
+DIGEST_OR_NONE = f"({DIGEST})?"
+TEXT = "(?s).*"
 AS_RECORDED = "the record must agree with the attributes of its version"
-Test = Callable[[object], bool]
+# a pattern of the whole text, [shape of each element], {key: shape of its value, which may
+# be missing}, or a test
+Shape = str | list[Any] | dict[str, Any] | Callable[[Any], bool]
 Key = tuple[str, str, int]  # kind, take and generation of a version
 MAX_COUNT = 1 << 53  # number of bytes, or of elements along a dim
 
@@ -211,9 +199,8 @@ def subjects_of(kind: str, take: str, names: Iterable[str]) -> set[str]:
 
 def record_to_json(record: Record) -> tuple[bytes, str]:
     """Content of the file of a record, and its seal."""
-    body = {name: value for name, value in asdict(record).items() if name in FIELDS} | {
-        "format": FORMAT
-    }
+    body = {name: value for name, value in asdict(record).items() if name in FIELDS}
+    body["format"] = FORMAT
     seal = seal_of(body)
     return json.dumps(body | {"seal": seal}, indent=1).encode(), seal
 
@@ -236,7 +223,7 @@ def record_from_json(content: bytes, key: str) -> Record:
     seal = body.pop("seal", None)
     if seal != seal_of(body):
         raise ValueError("content that does not match its seal")
-    if set(body) != FIELDS:
+    if body.keys() != {*FIELDS, "format"}:
         raise ValueError(
             f"fields that do not match its format: {', '.join(sorted(body))[:200]}"
         )
@@ -246,7 +233,7 @@ def record_from_json(content: bytes, key: str) -> Record:
         raise (LaterError if version > SCHEMA_VERSION else ValueError)(
             f"schema version {version}"
         )
-    if wrong := [name for name, holds in CHECKS.items() if not holds(body[name])]:
+    if wrong := [name for name, form in FIELDS.items() if not _fits(body[name], form)]:
         raise ValueError(f"invalid values of {', '.join(wrong)}")
     if not {"schema_version", "software_version"} <= provenance.keys():
         raise ValueError("a record without provenance")
@@ -269,56 +256,28 @@ def _is_count(value: object) -> TypeGuard[int]:
     )
 
 
-def _is_text(value: object, pattern: str | re.Pattern[str] = r"(?s).*") -> bool:
-    return isinstance(value, str) and re.fullmatch(pattern, value) is not None
-
-
-def _is_digest_or_empty(value: object) -> bool:
-    return value == "" or _is_text(value, DIGEST)
-
-
-def _is_object(value: object) -> TypeGuard[dict[str, Any]]:
-    return isinstance(value, dict)
-
-
-def _is_list_of(test: Test, value: object) -> bool:
-    return isinstance(value, list) and all(map(test, value))
-
-
-def _is_object_of(test: Test, value: object) -> bool:
-    return _is_object(value) and all(map(test, value.values()))
-
-
-def _is_provenance(value: object) -> bool:
-    """Whether the parts of a provenance that skindb uses have the right types."""
-    return _is_object(value) and all(
-        holds(value[name]) for name, holds in PROVENANCE.items() if name in value
-    )
+def _fits(value: object, shape: Shape) -> bool:
+    """Whether a value in a file has a shape."""
+    if isinstance(shape, str):
+        return isinstance(value, str) and re.fullmatch(shape, value) is not None
+    if isinstance(shape, list):
+        return isinstance(value, list) and all(_fits(one, shape[0]) for one in value)
+    if isinstance(shape, dict):
+        return isinstance(value, dict) and all(
+            _fits(value[key], form) for key, form in shape.items() if key in value
+        )
+    return shape(value)
 
 
 def _is_input(value: object) -> bool:
     return (
-        _is_object(value)
-        and _is_text(value.get("kind"), KIND)
-        and _is_text(value.get("take"), TAKE)
-        and _is_count(value.get("generation"))
-        and _is_text(value.get("seal"))
-    )
-
-
-def _are_summary_parameters(value: object) -> bool:
-    return (
-        _is_object(value)
-        and _is_text(value.get("digest", ""))
-        and all(_is_count(value.get(name, 0)) for name in ("surfels", "seed"))
+        isinstance(value, dict) and value.keys() >= INPUT.keys() and _fits(value, INPUT)
     )
 
 
 def _are_contents(value: object) -> bool:
-    return (
-        _is_object(value)
-        and all(_is_text(name, GROUP) for name in value)
-        and all(map(_is_group, value.values()))
+    return isinstance(value, dict) and all(
+        _fits(name, GROUP) and _is_group(group) for name, group in value.items()
     )
 
 
@@ -326,51 +285,58 @@ def _is_group(value: object) -> bool:
     """Whether the description of a group has sizes for the dims of all variables, and
     labels of matching lengths.
     """
-    if not _is_object(value) or value.keys() != {"sizes", "variables", "labels"}:
+    if not isinstance(value, dict) or value.keys() != {"sizes", "variables", "labels"}:
         return False
     sizes = value["sizes"]
     names = value["variables"]
-    labels = value["labels"]
     return (
-        _is_object_of(_is_count, sizes)
-        and _is_list_of(lambda name: name in VARIABLES, names)
-        and all(sizes.keys() >= set(VARIABLES[name].dims) for name in names)
-        and _is_object_of(_are_labels, labels)
-        and all(len(names) == sizes.get(dim) for dim, names in labels.items())
+        all(map(_is_count, sizes.values()))
+        and _fits(names, [VARIABLES.__contains__])
+        and all(sizes.keys() >= {*VARIABLES[name].dims} for name in names)
+        and all(
+            _fits(labels, [_is_label]) and len(labels) == sizes.get(dim)
+            for dim, labels in value["labels"].items()
+        )
     )
 
 
-def _are_labels(value: object) -> bool:
-    return _is_list_of(lambda item: isinstance(item, str | int | float), value)
+def _is_label(value: object) -> bool:
+    return isinstance(value, str | int | float)
 
 
-# parts of a provenance that skindb reads without opening the version -> test of their values
-PROVENANCE: dict[str, Test] = {
+INPUT: dict[str, Shape] = {
+    "kind": KIND,
+    "take": TAKE,
+    "generation": _is_count,
+    "seal": TEXT,
+}
+# parts of a provenance that skindb reads without opening the version
+PROVENANCE: dict[str, Shape] = {
     "schema_version": _is_count,
-    "software_version": _is_text,
+    "software_version": TEXT,
     # a capture names files
-    "inputs": lambda value: _is_object(value) or _is_list_of(_is_input, value),
-    "consent_scope": lambda value: value is None or _is_list_of(_is_text, value),
+    "inputs": lambda value: isinstance(value, dict) or _fits(value, [_is_input]),
+    "consent_scope": lambda value: value is None or _fits(value, [TEXT]),
     "calibrated_by": _is_input,
     "relative_exposure": lambda value: isinstance(value, float),
-    "traits": _is_object,
-    "parameters": _is_object,
-    "status": _is_object,
-    "summary": _is_object,
-    "summary_parameters": _are_summary_parameters,
+    "traits": {},
+    "parameters": {},
+    "status": {},
+    "summary": {},
+    "summary_parameters": {"digest": TEXT, "surfels": _is_count},
 }
-# fields of a record -> test of their values
-CHECKS: dict[str, Test] = {
-    "kind": lambda value: _is_text(value, KIND),
-    "take": lambda value: _is_text(value, TAKE),
+# fields of a record, beside its format and seal
+FIELDS: dict[str, Shape] = {
+    "kind": KIND,
+    "take": TAKE,
     "generation": _is_count,
-    "path": lambda value: _is_text(value, VERSION),
-    "created": _is_text,
+    "path": VERSION,
+    "created": TEXT,
     "bytes": _is_count,
-    "names": partial(_is_list_of, lambda name: _is_text(name, TAKE)),
-    "provenance": _is_provenance,
-    "manifest": lambda value: _is_text(value, DIGEST),
-    "tables": _is_digest_or_empty,
-    "previous": _is_digest_or_empty,
+    "names": [TAKE],
+    "provenance": PROVENANCE,
+    "manifest": DIGEST,
+    "tables": DIGEST_OR_NONE,
+    "previous": DIGEST_OR_NONE,
     "contents": _are_contents,
 }

@@ -1,8 +1,8 @@
 """Restoring a database from a backup, without subjects who were withdrawn since.
 
 A restore writes into an empty place only. Until it is complete,
-`withdrawn/restoring.json` refuses every reader and writer, and the same call continues
-it. Nothing of a withdrawn subject is copied.
+`withdrawn/restoring.json` refuses every reader and writer, and the same call begins
+again. Nothing of a withdrawn subject is copied.
 """
 
 import json
@@ -94,7 +94,7 @@ def restore(
         Folder or bucket of the backup.
     url
         Folder or bucket of the database, which must be empty or missing. A restore that
-        was interrupted is continued.
+        was interrupted begins again.
     number
         Number of the state; default the newest.
     markers
@@ -224,63 +224,33 @@ def _require_empty(place: Place) -> None:
 
 
 def _copy_all(archive: Archive, place: Place, plan: Plan) -> int:
-    """Copy all files, except for those that are there already; returns the number of
-    bytes of all.
-    """
-    keys = {item[0] for item in plan.items} | plan.texts.keys()
-    present = _remove_others(place, keys)
-    written = sum(
-        size
-        for _, size in intact(
-            partial(_copy, archive, place, present), plan.items, plan.faults
-        )
-    )
+    """Copy all files; returns the number of their bytes."""
+    _remove_left(place)
+    copied = intact(partial(_copy, archive, place), plan.items, plan.faults)
+    written = sum(size for _, size in copied)
     for key, content in plan.texts.items():
-        if (
-            not place.create(key, content, flush_names=False)
-            and place.read_small(key) != content
-        ):
-            place.remove(key)
-            place.create(key, content, flush_names=False)
-    place.flush_names([*keys])
+        place.create(key, content, flush_names=False)
+    place.flush_names([*(key for key, _, _ in plan.items), *plan.texts])
     return written
 
 
-def _remove_others(place: Place, keys: set[str]) -> set[str]:
-    """Remove everything that an interrupted restore has written if some of it is no
-    longer to be restored.
-
-    It may be of a subject who was withdrawn since, whose pseudonym must not remain in
-    the name of an empty folder. Returns the keys of the files that are left.
+def _remove_left(place: Place) -> None:
+    """Remove everything that an interrupted restore has written: it may be of a subject
+    who was withdrawn since.
     """
     place.sweep()
-    tops = [name for name in place.names() or [] if name not in (STAGING, "leases")]
-    present = {f"{top}/{name}" for top in tops for name in place.sizes(top)} - {LOCK}
-    folders = {
-        key.rsplit("/", depth)[0]
-        for key in keys
-        for depth in range(1, key.count("/") + 1)
-    }
-    foreign = present - keys
-    if not foreign - folders:
-        return present
-    for top in tops:
-        if top != WITHDRAWN:
+    for name in place.children(WITHDRAWN):
+        if name != RESTORING:
+            place.remove(f"{WITHDRAWN}/{name}")
+    for top in place.names() or []:
+        if top not in (STAGING, WITHDRAWN, "leases"):
             place.remove(top)
-    for key in foreign:
-        place.remove(key)
-    return set()
 
 
-def _copy(archive: Archive, place: Place, present: set[str], item: Item) -> int:
-    """Copy a file unless it is there already; returns its size."""
-    key, digest, size = item
-    if key in present:
-        if place.digests(key).whole == digest:
-            return size or 0
-        place.remove(key)
+def _copy(archive: Archive, place: Place, item: Item) -> int:
+    """Copy a file; returns its size."""
     content = archive.read(item)
-    place.create(key, content, flush_names=False)
+    place.create(item[0], content, flush_names=False)
     return len(content)
 
 

@@ -4,6 +4,7 @@ import hashlib
 import json
 import math
 import uuid
+import warnings
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -15,8 +16,6 @@ import numpy as np
 import xarray as xr
 import zarr
 from zarr.codecs import BloscCodec
-from zarr.core.buffer import default_buffer_prototype
-from zarr.core.sync import sync
 
 from skindb import __version__
 from skindb.errors import Fault, InputError, add_filename, input_error
@@ -122,7 +121,6 @@ class Stage:
         self._is_declared = kind in KINDS_OF_ONE_SUBJECT
         self.contents: dict[str, Any] = {}
         self.groups: set[str] = set()
-        self._nodes: set[str] = set()  # groups, and their arrays
         self.tables: xr.Dataset | None = None
 
     def __enter__(self) -> Self:
@@ -181,7 +179,6 @@ class Stage:
         self.contents |= {name: describe(ds) for name, ds in datasets.items()}
         self.groups |= groups.keys()
         for name, ds in groups.items():
-            self._nodes |= {name, *(f"{name}/{variable}" for variable in ds.variables)}
             ready = _whole_shards(ds).assign_attrs(plain(ds.attrs))
             encoding = {str(v): _encoding(ready[v]) for v in ready.variables}
             # the search for empty chunks would take as long as their compression
@@ -253,31 +250,16 @@ class Stage:
 
     def _write_metadata(self, attrs: Mapping[str, Any]) -> None:
         """Write the metadata of the root and of each group with those of all nodes below
-        it, so that a reader opens it by one file; `zarr.consolidate_metadata` would warn
-        about format 3.
+        it, so that a reader opens it by one file.
         """
-        nodes: dict[str, dict[str, Any]] = {}
-        for node in sorted(self._nodes, key=lambda name: (name.count("/"), name)):
-            with suppress(OSError):  # `_written_files` reports a missing one
-                content = self.place.read(f"{self.path}/{node}/zarr.json")
-                nodes[node] = json.loads(content)
         store = self.place.writable(self.path)
-        root = {"zarr_format": 3, "node_type": "group", "attributes": attrs}
-        groups = {f"{name}/": nodes[name] for name in self.groups & nodes.keys()}
-        for path, group in {**groups, "": root}.items():
-            below = {
-                name.removeprefix(path): node
-                for name, node in nodes.items()
-                if name.startswith(path)
-            }
-            consolidated = {
-                "kind": "inline",
-                "must_understand": False,
-                "metadata": below,
-            }
-            text = json.dumps({**group, "consolidated_metadata": consolidated})
-            buffer = default_buffer_prototype().buffer.from_bytes(text.encode())
-            sync(store.set(f"{path}zarr.json", buffer))
+        root = zarr.open_group(store, mode="a", zarr_format=3)
+        root.attrs.put(attrs)
+        with warnings.catch_warnings():  # that format 3 does not specify them yet
+            warnings.simplefilter("ignore")
+            for group in (*sorted(self.groups), ""):
+                with suppress(FileNotFoundError):  # `_written_files` reports it
+                    zarr.consolidate_metadata(store, path=group, zarr_format=3)
 
     def _written_files(self) -> Manifest:
         """Size and digests of every file, with those of all groups that were written."""

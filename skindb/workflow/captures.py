@@ -45,7 +45,7 @@ from skindb.ingest.report import capture_provenance
 from skindb.ingest.spool import remove_stale
 from skindb.parameters import CalibrationParameters
 from skindb.schema import variables
-from skindb.schema.consent import CONSENT, require_consent
+from skindb.schema.consent import CONSENT
 from skindb.store import (
     CALIBRATION,
     Database,
@@ -201,9 +201,7 @@ def _ingest(
     with add_filename(str(scratch)), lease:
         # what was recorded since counts, not the folder
         if db.has(CONSENT, subject_of(capture.take)):
-            require_consent(
-                {"consent_scope": db.consent(capture.take), "take": capture.take}, "fit"
-            )
+            db.require_consent(capture.take, "fit")
         with (
             one_blas_thread(),
             ingest_capture(

@@ -34,7 +34,6 @@ from skindb.analysis.summary import (
 from skindb.errors import require
 from skindb.fit import prediction_table
 from skindb.schema import FitStatus, dataset, variables
-from skindb.schema.consent import require_consent
 from skindb.schema.label import FACE
 from skindb.store import SUMMARY, CohortRequest, Database, Lookup, Record, lacking
 from skindb.types import Progress, silent
@@ -53,8 +52,6 @@ def summarise(
     db: Database,
     takes: Sequence[str] | None = None,
     *,
-    surfels: int = SAMPLED,
-    seed: int = 0,
     size: int = SIZE,
     maps: Sequence[str] | None = None,
     workers: int | None = None,
@@ -62,9 +59,9 @@ def summarise(
 ) -> list[str]:
     """Store what cohorts with these options need, for takes that lack it.
 
-    New models and registrations keep their tables, a sample of 5,000 surfels with the
-    seed 0, and maps of 512 texels; this is for other samples and sizes, and for models
-    that were summarised by other code.
+    New models and registrations keep their tables, a sample of 5,000 surfels, and maps
+    of 512 texels; this is for other sizes of maps, and for models that were summarised
+    by other code.
 
     Parameters
     ----------
@@ -72,8 +69,6 @@ def summarise(
         Database with models.
     takes
         Default all.
-    surfels, seed
-        Number of surfels of the samples, and their random seed.
     size
         Texels along each side of the maps, for takes that are registered.
     maps
@@ -96,18 +91,18 @@ def summarise(
     names = db.takes("model", release=release) if takes is None else list(takes)
     code = summary_digest()
     tables = CohortRequest("tables", digest=code)
-    sample = CohortRequest("surfels", surfels=surfels, seed=seed, digest=code)
+    sample = CohortRequest("surfels", surfels=SAMPLED, digest=code)
     chosen = None if maps is None else tuple(maps)
     map_request = CohortRequest("maps", size=size, digest=code, maps=chosen)
     lookup = Lookup(db, release)
     registered = [take for take in names if lookup.has("registration", take)]
     steps = [
-        ("model", names, [tables, sample], partial(_summarise_model, db, sample)),
+        ("model", names, [tables, sample], partial(_summarise_model, db)),
         (
             "registration",
             registered,
             [sample],
-            partial(_summarise_registration, db, sample, size),
+            partial(_summarise_registration, db, size),
         ),
         ("registration", registered, [map_request], partial(_map, db, map_request)),
     ]
@@ -126,11 +121,9 @@ def summary_digest() -> str:
     return code_digest(*SUMMARY_METHOD)
 
 
-def summary_parameters(
-    *, surfels: int = SAMPLED, seed: int = 0, size: int | None = None
-) -> dict[str, Any]:
+def summary_parameters(*, size: int | None = None) -> dict[str, Any]:
     """How the parts for cohorts are computed, as versions record it."""
-    parameters = {"surfels": surfels, "seed": seed, "digest": summary_digest()}
+    parameters = {"surfels": SAMPLED, "digest": summary_digest()}
     return parameters if size is None else parameters | {"size": size}
 
 
@@ -155,23 +148,19 @@ def tables_of(model: xr.DataTree) -> xr.Dataset:
     )
 
 
-def sample_groups(
-    model: xr.DataTree, *, surfels: int = SAMPLED, seed: int = 0
-) -> dict[str, xr.Dataset]:
+def sample_groups(model: xr.DataTree) -> dict[str, xr.Dataset]:
     """The group "sample" of a model; none if no surfel was fitted."""
     if not bool(
         (model["fitted"].to_dataset()[variables.FIT_STATUS] == FitStatus.FITTED).any()
     ):
         return {}
-    return {"sample": sample_surfels(model, surfels=surfels, seed=seed)}
+    return {"sample": sample_surfels(model)}
 
 
 def registered_parts(
     model: xr.DataTree,
     registered: xr.Dataset,
     *,
-    surfels: int = SAMPLED,
-    seed: int = 0,
     size: int = SIZE,
 ) -> dict[str, xr.Dataset]:
     """Groups and tables that cohorts need of a registered take: maps, and the regions
@@ -180,7 +169,7 @@ def registered_parts(
     fitted = model["fitted"].to_dataset().load()
     masks = take_masks(model, registered)
     groups = {"maps": common_maps(model, registered, size=size)}
-    if sampled := sample_groups(model, surfels=surfels, seed=seed):
+    if sampled := sample_groups(model):
         index = sampled["sample"][variables.SURFEL_INDEX].values
         mask = np.array([mask[index] for mask in masks.values()]).reshape(
             len(masks), len(index)
@@ -194,20 +183,15 @@ def registered_parts(
     return groups
 
 
-def _summarise_model(db: Database, sample: CohortRequest, record: Record) -> Record:
+def _summarise_model(db: Database, record: Record) -> Record:
     model = db.read("model", record.take, generation=record.generation)
-    groups = sample_groups(model, surfels=sample.surfels, seed=sample.seed)
-    parameters = summary_parameters(surfels=sample.surfels, seed=sample.seed)
-    return _commit_summary(db, record, groups | {TABLES: tables_of(model)}, parameters)
+    groups = sample_groups(model) | {TABLES: tables_of(model)}
+    return _commit_summary(db, record, groups, summary_parameters())
 
 
-def _summarise_registration(
-    db: Database, sample: CohortRequest, size: int, record: Record
-) -> Record:
-    options = {"surfels": sample.surfels, "seed": sample.seed, "size": size}
-    model, registered = _registered_model(db, record)
-    groups = registered_parts(model, registered, **options)
-    return _commit_summary(db, record, groups, summary_parameters(**options))
+def _summarise_registration(db: Database, size: int, record: Record) -> Record:
+    groups = registered_parts(*_registered_model(db, record), size=size)
+    return _commit_summary(db, record, groups, summary_parameters(size=size))
 
 
 def _map(db: Database, request: CohortRequest, record: Record) -> Record:
@@ -245,7 +229,6 @@ def _commit_summary(
         names=record.names,
         parameters=parameters,
         summary_parameters=parameters,
-        seeds={"sample": parameters["seed"]},
     )
     summary = xr.DataTree.from_dict(groups)
     summary.attrs["consent_scope"] = record.provenance.get("consent_scope", [])
@@ -288,7 +271,7 @@ def register_takes(
         If no take can be registered, or if a take that was named does not consent to statistics.
     """
     for take in takes or ():
-        require_consent({"consent_scope": db.consent(take), "take": take}, "statistics")
+        db.require_consent(take, "statistics")
     names = sorted(takes_with_landmarks(db, takes))
     require(
         names,

@@ -19,7 +19,6 @@ from skindb.reflectance.kinds import require_mixture
 from skindb.render.figures import write_grid
 from skindb.render.rendering import frontal_camera, radiance_of
 from skindb.schema import variables
-from skindb.schema.consent import require_consent
 from skindb.store import STUDY, Database, Record, require_fresh
 from skindb.types import Float32, Progress, lengths, silent
 from skindb.workflow import studies
@@ -132,7 +131,7 @@ def edit_grid(
     """
     source = editable_model(db, take, study, dictionary)
     report = progress or silent
-    require_consent({**source.model.attrs, "take": take}, "export")
+    db.require_consent(take, "export")
     options.setdefault("scale", _grid_scale(source.model))
     plain = radiance_of(source.model, **options)
     pictures = {}
@@ -191,7 +190,7 @@ def basis_grid(
         Column -> relative RMS difference of its picture from that with the whole dictionary.
     """
     model = db.read("model", take)
-    require_consent({**model.attrs, "take": take}, "export")
+    db.require_consent(take, "export")
     require_mixture(model["fitted"].to_dataset(), f"model of {take}")
     names = [str(name) for name in model["fitted"].to_dataset()["dictionary"].values]
     tables = studies.dictionary_tables(
@@ -254,7 +253,7 @@ def editable_model(
     study = _trait_study(db, study)
     model = db.read("model", take)
     vectors = db.read(STUDY, study)
-    require_consent({**model.attrs, "take": take}, "statistics")
+    db.require_consent(take, "statistics")
     require_fresh(db, STUDY, study)
     require_mixture(model["fitted"].to_dataset(), f"model of {take}")
     brdfs = [str(name) for name in model["fitted"].to_dataset()["dictionary"].values]

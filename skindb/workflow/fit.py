@@ -13,7 +13,6 @@ from skindb.errors import InputError, input_error
 from skindb.fit import FitParameters, FitPlan, first_pass, plan_fit, second_pass
 from skindb.reflectance.brdf_files import read_dictionary
 from skindb.reflectance.dictionary import EMBEDDED, Dictionary, embedded_dictionary
-from skindb.schema.consent import require_consent
 from skindb.store import Database, Lease, Record
 from skindb.threads import one_blas_thread
 from skindb.types import Progress
@@ -76,7 +75,7 @@ def fit_take(
     ):
         capture = db.read("capture", take, generation=generation)
         # the newest record decides
-        require_consent({"consent_scope": db.consent(take), "take": take}, "fit")
+        db.require_consent(take, "fit")
         read = db.record("capture", take, capture.attrs["generation"])
         derivation = fit_derivation(db, read, requested, dictionary)
         first_tree = _stored_first_pass(derivation)

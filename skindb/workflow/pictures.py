@@ -20,7 +20,6 @@ from skindb.render.photographs import Comparison, compare_photographs
 from skindb.render.rendering import chosen_camera, render, render_picture
 from skindb.render.scene import Camera, Environment, Lights
 from skindb.schema import variables
-from skindb.schema.consent import require_consent
 from skindb.store import Database, UnavailableError, require_fresh
 from skindb.types import Progress, float64, silent
 from skindb.view.face import Trait, face_record, page_omissions, still_picture
@@ -126,7 +125,7 @@ def show_take(
         raise input_error(
             "take", "a take of the database is drawn", take, f"choose {takes}"
         )
-    require_consent({"consent_scope": db.consent(take), "take": take}, "export")
+    db.require_consent(take, "export")
     return write_field(trees, variable, out, at=at)
 
 
@@ -178,7 +177,7 @@ def _model(
     """A model or an edit whose subject agrees to exports; a stale edit is refused, or warned of."""
     kind = "edit" if edited else "model"
     model = db.read(kind, take, generation=generation)
-    require_consent({**model.attrs, "take": take}, "export")
+    db.require_consent(take, "export")
     if generation is None:  # who names one knows which it is
         require_fresh(db, kind, take)
     return model
@@ -274,7 +273,7 @@ def _diffusion_lengths(db: Database, site: str) -> dict[str, float]:
     for take in db.takes("model"):
         model = db.read("model", take)
         try:
-            require_consent({**model.attrs, "take": take}, "export")
+            db.require_consent(take, "export")
         except InputError:
             continue
         if "translucency" not in model.children:
@@ -477,7 +476,7 @@ def _faces(
     for number, take in enumerate(takes):
         report("view", number, len(takes))
         model = db.read("model", take)
-        require_consent({**model.attrs, "take": take}, "export")
+        db.require_consent(take, "export")
         require_fresh(db, "model", take)
         unedited, moved = _moved(db, take, model, traits, study, dictionary)
         attributes = _attributes(db, take, model)
@@ -514,7 +513,7 @@ def explain_view(
     see `view_takes`.
     """
     model = db.read("model", take)
-    require_consent({**model.attrs, "take": take}, "export")
+    db.require_consent(take, "export")
     return page_omissions(model, edited=bool(traits))
 
 

@@ -96,7 +96,7 @@ def test_logged__a_call_in_a_notebook_is_one_entry(db, tmp_path):
     workflow.show_take(db, "S01", "fit_status", tmp_path / "a.png")
     workflow.fit_take(db, "S02", PARAMETERS, dictionary=few_materials())
     workflow.coverage(db, takes=["S01"])
-    workflow.summarise(db, ["S01", "S02"], surfels=20)
+    workflow.summarise(db, ["S01", "S02"])
     workflow.record_consent(db, "S02", ["fit"])
     assert _actions(db) == [
         ("show", 1),
