@@ -208,8 +208,8 @@ def translucency_grid(
     """Draw the takes with the shortest and the longest diffusion length at a site, with
     one light and one exposure.
 
-    The columns are the face with light under the skin, the edge of the nose's shadow
-    close up, and the same with light that is reflected where it enters.
+    The columns are close-ups of the edge of the nose's shadow with light under the skin,
+    and with light that is reflected where it enters.
 
     Parameters
     ----------
@@ -242,29 +242,28 @@ def translucency_grid(
             f"{len(lengths)}",
             "name another site, or fit more takes",
         )
-    chosen = [
-        min(lengths, key=lengths.__getitem__),
-        max(lengths, key=lengths.__getitem__),
-    ]
     report = progress or silent
     rows = {}
-    for i, take in enumerate(chosen):
-        report("render", 3 * i, 6)
+    chosen = dict[str, float]()
+    for i, extreme in enumerate((min, max)):
+        report("render", i, 2)
+        take = extreme(lengths, key=lengths.__getitem__)
         model = db.read("model", take)
-        far, near = _cameras(model)
-        options: dict[str, Any] = {"lights": _light(model), "samples": samples}
-        close: dict[str, Any] = {"camera": near, "spacing": SPACING * lengths[take]}
+        options: dict[str, Any] = {
+            "camera": _close_up(model),
+            "lights": _light(model),
+            "samples": samples,
+            "spacing": SPACING * lengths[take],
+        }
         pictures = [
-            render(model, camera=far, subsurface=True, **options),
-            render(model, subsurface=True, **close, **options),
-            render(model, **close, **options),
+            render(model, subsurface=under, **options) for under in (True, False)
         ]
-        rows[f"{take}\n{lengths[take]:.2f} mm"] = [
-            picture["radiance"].values for picture in pictures
-        ]
-    report("render", 6, 6)
-    write_grid(out, rows, ["light under the skin", "close up", "without"])
-    return {take: lengths[take] for take in chosen}
+        title = f"{take}\n{lengths[take]:.2f} mm"
+        rows[title] = [picture["radiance"].values for picture in pictures]
+        chosen[take] = lengths[take]
+    report("render", 2, 2)
+    write_grid(out, rows, ["light under the skin", "without"])
+    return chosen
 
 
 def _diffusion_lengths(db: Database, site: str) -> dict[str, float]:
@@ -315,12 +314,9 @@ def _light(model: xr.DataTree) -> Lights:
     )
 
 
-def _cameras(model: xr.DataTree) -> tuple[Camera, Camera]:
-    """The frontal camera of the dome with a small picture, and one that looks at the
-    edge of the nose's shadow.
-    """
+def _close_up(model: xr.DataTree) -> Camera:
+    """A camera that looks at the edge of the nose's shadow from the front."""
     frontal, _ = chosen_camera(model["dome"].to_dataset().load(), None)
-    scale = SIDE_PX / max(frontal.width, frontal.height)
     # beside the nose, on the side away from the light
     place = _nose(model) + np.array([-14.0, -2.0, -14.0])
     seen = frontal.R @ place + frontal.t
@@ -328,12 +324,7 @@ def _cameras(model: xr.DataTree) -> tuple[Camera, Camera]:
     zoom = SIDE_PX / (CLOSE_MM * frontal.K[0, 0] / seen[2])
     K = np.diag([zoom, zoom, 1.0]) @ frontal.K
     K[:2, 2] += SIDE_PX / 2 - zoom * pixel
-    far = frontal.scaled(scale)
-    middle = far.K.copy()
-    middle[:2, 2] += (SIDE_PX - far.width) / 2, (SIDE_PX - far.height) / 2
-    return replace(far, K=middle, width=SIDE_PX, height=SIDE_PX), replace(
-        frontal, K=K, distortion=np.zeros(5), width=SIDE_PX, height=SIDE_PX
-    )
+    return replace(frontal, K=K, distortion=np.zeros(5), width=SIDE_PX, height=SIDE_PX)
 
 
 @logged("view")

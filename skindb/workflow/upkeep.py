@@ -117,29 +117,28 @@ def repeat_requests(
         One for each request, in order of dependence. What fails for any reason is named
         there, and stays requested.
     """
-    makers = {
-        "registration": lambda request: _repeat_registration(db, request),
-        STUDY: lambda request: repeat_study(
-            db, request.take, request.parameters, dictionary=dictionary
-        ),
-        "edit": lambda request: repeat_edit(
-            db, request.take, request.parameters, dictionary=dictionary
-        ),
-        RELEASE: lambda request: _repeat_release(db, request),
-    }
     requests = sorted(
         db.requests(), key=lambda request: (KINDS.index(request.kind), request.take)
     )
     results = []
     for request in requests:
         if request.kind in kinds:
-            outcome = _again(
-                requested_result(request), partial(makers[request.kind], request)
-            )
+            make = partial(_repeat, db, dictionary, request)
+            outcome = _again(requested_result(request), make)
             if outcome.record is not None:
                 db.fulfil(request)
             results.append(outcome)
     return results
+
+
+def _repeat(db: Database, dictionary: Path | None, request: Request) -> Record:
+    """Compute a result again."""
+    if request.kind == "registration":
+        return _repeat_registration(db, request)
+    if request.kind == RELEASE:
+        return _repeat_release(db, request)
+    repeat = repeat_study if request.kind == STUDY else repeat_edit
+    return repeat(db, request.take, request.parameters, dictionary=dictionary)
 
 
 def repeat_study(
@@ -282,8 +281,7 @@ def _repeat_again(
 ) -> list[Refreshed]:
     def repeat(result: Refreshed) -> Record:
         parameters = db.record(result.kind, result.take).provenance["parameters"]
-        repeat_one = repeat_study if result.kind == STUDY else repeat_edit
-        return repeat_one(db, result.take, parameters, dictionary=dictionary)
+        return _repeat(db, dictionary, Request(result.kind, result.take, parameters))
 
     return [_again(result, partial(repeat, result)) for result in stale]
 

@@ -78,7 +78,7 @@ def test_translucency_grid__shows_the_extremes(db, tmp_path, monkeypatch):
     assert read_png(tmp_path / "grid.png").std() > 0.05
     # light reaches further into the shadow of the more translucent take: less of the
     # close-up is dark
-    (_, near, local), (_, wide, _) = drawn.values()
+    (near, local), (wide, _) = drawn.values()
     level = 0.05 * np.median(local[local > 0])
     dark = [
         float((picture.mean(axis=-1) < level).mean()) for picture in (wide, near, local)
