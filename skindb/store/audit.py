@@ -12,7 +12,6 @@ import json
 import re
 import uuid
 from collections.abc import Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
@@ -21,7 +20,13 @@ from typing import Any
 from skindb import __version__
 from skindb.errors import Fault, InputError, input_error
 from skindb.store.markers import is_sealed, keyed_hash, keyed_seal, require_secret
-from skindb.store.place import AUDIT, Place, UnavailableError, subject_of
+from skindb.store.place import (
+    AUDIT,
+    Place,
+    UnavailableError,
+    in_parallel,
+    subject_of,
+)
 from skindb.store.record import collect_faults, damage_as_fault, json_object
 
 FORMAT = 1
@@ -30,7 +35,6 @@ BLOCK_NAME = r"[0-9]{6}"
 ENTRY_NAME = r"[0-9]{9}\.json"
 # of a writer; each failed attempt means that another writer has created an entry
 MAX_ATTEMPTS = 1_000
-THREADS = 8  # that read entries
 RULE = "an entry of the audit log must be as it was created"
 RESTORE = "restore it from a backup"
 
@@ -157,13 +161,12 @@ def read_audit(
     if secret is None:
         return [], faults
     entries: dict[int, AuditEntry] = {}
-    with ThreadPoolExecutor(THREADS) as threads:
-        outcomes = threads.map(partial(_outcome, place, secret), numbers)
-        for number, outcome in zip(numbers, outcomes, strict=True):
-            if isinstance(outcome, Fault):
-                faults.append(outcome)
-            else:
-                entries[number] = outcome
+    outcomes = in_parallel(partial(_outcome, place, secret), numbers)
+    for number, outcome in zip(numbers, outcomes, strict=True):
+        if isinstance(outcome, Fault):
+            faults.append(outcome)
+        else:
+            entries[number] = outcome
     faults += _chain_faults(place, numbers, entries)
     selected = list(entries.values())
     if subject is not None:

@@ -16,7 +16,6 @@ import tempfile
 import time
 import uuid
 from collections.abc import AsyncIterator, Callable, Hashable, Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
@@ -34,6 +33,7 @@ from skindb.store.place import (
     Place,
     UnavailableError,
     digests_of,
+    in_parallel,
     require_parts,
 )
 from skindb.store.s3 import (
@@ -51,7 +51,6 @@ T = TypeVar("T")
 # before a request is repeated whose answer was lost and that obstore does not repeat
 PAUSES_S = (0.2, 1.0, 5.0)
 METADATA = "/zarr.json"
-THREADS = 16  # write zarr.json objects in parallel
 FETCH_BYTES = 1 << 23  # read at a time while a digest is computed
 
 
@@ -169,16 +168,13 @@ class Bucket:
             return self._pending[path]
         if end is not None and end <= begin:
             return b""
+        options: dict[str, Any] = {}
         if end is not None:
-            return self._ask(
-                key, lambda: bytes(self._store.get_range(path, start=begin, end=end))
-            )
-        part: Any = {"offset": begin} if begin > 0 else {"suffix": -begin}
+            options = {"range": (begin, end)}
+        elif begin:
+            options = {"range": {"offset": begin} if begin > 0 else {"suffix": -begin}}
         return self._ask(
-            key,
-            lambda: bytes(
-                self._store.get(path, options={"range": part} if begin else {}).bytes()
-            ),
+            key, lambda: bytes(self._store.get(path, options=options).bytes())
         )
 
     def read_small(self, key: str) -> bytes:
@@ -249,12 +245,7 @@ class Bucket:
     def make_durable(self, key: str, *, flush: bool = True) -> None:  # noqa: ARG002
         """Write pending metadata, and check that every object is stored as it was acknowledged."""
         names = [f"{key}/{name}" for name in self.pending(key)]
-        with ThreadPoolExecutor(THREADS) as threads:
-            list(
-                threads.map(self.write, names, [self._pending[name] for name in names])
-            )
-        for name in names:
-            del self._pending[name]
+        in_parallel(lambda name: self.write(name, self._pending.pop(name)), names)
         stored = self._objects(key)
         for path, (_, tag) in list(self._written.items()):
             if path.startswith(f"{key}/"):

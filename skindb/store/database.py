@@ -53,7 +53,7 @@ from skindb.store.snapshot import (
     pinned_record,
     pins_of,
 )
-from skindb.store.stage import Stage, read_tables, remove_version
+from skindb.store.stage import Stage, read_tables
 from skindb.store.stale import Request, read_requests, remove_request
 from skindb.store.verify import database_faults
 
@@ -544,26 +544,6 @@ class Database:
     def fulfil(self, request: Request) -> None:
         """Remove a request, because its result was computed."""
         remove_request(self.place, request)
-
-    def discard(self, kind: str, take: str, path: str) -> None:
-        """Remove the data of a version that a killed writer left; a version that a
-        record names is kept.
-
-        Raises
-        ------
-        InputError
-            If `path` is not the path of a version of this take, or if the log cannot be read.
-        """
-        if not path.startswith(f"data/{kind}/{take}/"):
-            raise input_error(
-                f"{self.url}: {path[:200]!r}",
-                f"must be the path of a {kind} of {take}",
-                "a different path",
-                "remove the folder tmp of the database",
-            )
-        log = Log(self.place, kind, take)
-        if path not in {log.read(generation).path for generation in log.generations()}:
-            remove_version(self.place, path)
 
     def forget(self, kind: str, take: str) -> None:
         """Remove all versions of a transient kind, such as the first pass of a fit,

@@ -82,15 +82,19 @@ class Holdings:
     caches: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
-        parts = (
-            self.takes,
-            self.versions,
-            self.unrecorded,
-            self.requests,
-            self.scratch,
-            self.caches,
-        )
-        return any(map(bool, parts))
+        return bool(self.keys)
+
+    @property
+    def keys(self) -> list[str]:
+        """Keys of the data of everything that is held."""
+        return [
+            *(f"data/{kind}/{take}" for kind, take in self.takes),
+            *(record.path for record in self.versions),
+            *self.unrecorded,
+            *(request.key for request in self.requests),
+            *self.caches,
+            *(f"tmp/{folder.name}" for folder in self.scratch),
+        ]
 
     @property
     def counts(self) -> Counter[str]:

@@ -243,29 +243,8 @@ def _of_withdrawn_subjects(place: Place, markers: Markers) -> Iterator[Garbage]:
     """What interrupted withdrawals, and writers that were suspended during one, left of
     withdrawn subjects.
     """
-    holdings = holdings_of(place, markers)
-    for kind, take in holdings.takes:
-        keys = [f"{top}/{kind}/{take}" for top in ("data", "log", "leases")]
-        yield Garbage(
-            f"log/{kind}/{take}",
-            OF_WITHDRAWN,
-            sum(_bytes_below(place, key) for key in keys),
-        )
-    for record in holdings.versions:
-        key = f"log/{record.kind}/{record.take}/{record.generation:08d}.json"
-        yield Garbage(key, OF_WITHDRAWN, record.bytes)
-    for key in (
-        *holdings.unrecorded,
-        *(request.key for request in holdings.requests),
-        *holdings.caches,
-    ):
+    for key in holdings_of(place, markers).keys:
         yield Garbage(key, OF_WITHDRAWN, _bytes_below(place, key))
-    for folder in holdings.scratch:
-        yield Garbage(
-            f"tmp/{folder.name}",
-            OF_WITHDRAWN,
-            _bytes_below(place, f"tmp/{folder.name}"),
-        )
 
 
 def _bytes_below(place: Place, key: str) -> int:

@@ -229,12 +229,7 @@ class Lookup:
 
     def scope(self, take: str) -> tuple[str, ...]:
         """Scopes of the present consent of the subject of a take; see `Database.consent`."""
-        subject = subject_of(take)
-        if self.has(CONSENT, subject):
-            return consent_scope(self.record(CONSENT, subject).provenance)
-        if self._pins is not None:
-            return consent_of(self._source, take)
-        return consent_scope(self.about(take))
+        return consent_of(self._source, take)
 
     def _is_pinned(self, kind: str) -> bool:
         return self._pins is not None and kind in PINNED

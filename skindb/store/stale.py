@@ -14,6 +14,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
+from functools import cache as cached
 from functools import partial
 from typing import Any, Literal
 
@@ -100,8 +101,8 @@ class Staleness:
         self._cache = cache
         self._snapshot = Snapshot(db.place)
         self._known: dict[Key, tuple[Reason, ...]] = {}
-        self._newest: dict[tuple[str, str], int] = {}
-        self._covered: dict[str, bool] = {}
+        self._newest_of = cached(self._find_newest)
+        self._is_covered = cached(self._find_cover)
 
     def reasons(self, record: Record) -> tuple[Reason, ...]:
         """Reasons why a version is stale; empty if it is not.
@@ -156,17 +157,16 @@ class Staleness:
                 if not (_is_of_release(record) and one.why == "superseded")
             )
 
-    def _is_covered(self, take: str) -> bool:
-        if take not in self._covered:
-            # None: the consent of the subject is unknown
-            scope = intact_or_none(partial(consent_of, self._records(CONSENT), take))
-            self._covered[take] = scope is not None and "statistics" in scope
-        return self._covered[take]
+    def _find_cover(self, take: str) -> bool:
+        """Whether the consent of the subject of a take covers statistics; False if it is
+        unknown.
+        """
+        scope = intact_or_none(partial(consent_of, self._records(CONSENT), take))
+        return scope is not None and "statistics" in scope
 
-    def _newest_of(self, kind: str, take: str) -> int:
-        if (kind, take) not in self._newest:
-            self._newest[kind, take] = self._records(kind).record(kind, take).generation
-        return self._newest[kind, take]
+    def _find_newest(self, kind: str, take: str) -> int:
+        """Generation of the newest version of a take."""
+        return self._records(kind).record(kind, take).generation
 
     def _records(self, kind: str) -> Records:
         if self._cache is not None and kind in CACHED_KINDS:

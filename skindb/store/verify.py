@@ -4,7 +4,7 @@ faults are reported together.
 
 import re
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import xarray as xr
 
@@ -28,6 +28,7 @@ from skindb.store.place import (
     TRANSIENT,
     Place,
     UnavailableError,
+    in_parallel,
 )
 from skindb.store.record import AS_RECORDED, Record, json_object
 from skindb.store.stage import TABLES, describe, read_names, tables_from_json
@@ -57,7 +58,6 @@ LAYOUT = {
     GATHERED: (GATHERED_NAME,),
     CATALOGUE: (CATALOGUE_BLOCK,),
 }
-THREADS = 8  # that read files; a server answers many requests in parallel
 FILE_BESIDE = re.compile(r"\.(manifest|tables)\.json")
 
 
@@ -113,14 +113,10 @@ def _withdrawn_faults(place: Place) -> list[Fault]:
         raise
     except InputError as error:  # of the secret, which `marker_faults` reports
         return [fault for fault in error.faults if fault.where != place.where(SECRET)]
-    remains = [f"{kind} of {take}" for kind, take in holdings.takes]
-    remains += [record.title for record in holdings.versions]
-    remains += [place.where(key) for key in (*holdings.unrecorded, *holdings.caches)]
-    remains += [*map(str, holdings.requests), *map(str, holdings.scratch)]
     rule = "nothing of a withdrawn subject must remain"
     cure = "run skindb clean --yes"
     finding = "data that the withdrawal did not remove, or that came later"
-    return [Fault(location, rule, finding, cure) for location in remains]
+    return [Fault(place.where(key), rule, finding, cure) for key in holdings.keys]
 
 
 def _layout_faults(
@@ -238,14 +234,8 @@ def version_faults(place: Place, record: Record) -> list[Fault]:
             read_beside(place, record, TABLES, record.tables) if record.tables else b""
         )
         sizes = place.sizes(record.path)
-        names = sorted(sizes.keys() | manifest.keys())
-        with ThreadPoolExecutor(THREADS) as threads:
-            finding = list(
-                threads.map(
-                    lambda name: _file_fault(place, record, manifest, sizes, name),
-                    names,
-                )
-            )
+        check = partial(_file_fault, place, record, manifest, sizes)
+        finding = in_parallel(check, sorted(sizes.keys() | manifest.keys()))
         faults = [fault for fault in finding if fault is not None]
         return faults or _record_faults(place, record, tables)
     except InputError as error:

@@ -4,7 +4,6 @@ dated, versioned, and named by the captures that used them.
 
 import shutil
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,7 @@ from skindb.calibration.setup import (
     read_setup_dome,
 )
 from skindb.errors import Fault, InputError, add_filename, input_error, require
-from skindb.files import plain, private_file
+from skindb.files import plain
 from skindb.format.dome import DomeRecord
 from skindb.format.fields import NAME, read_json
 from skindb.format.frames import Digests
@@ -60,7 +59,6 @@ from skindb.workflow.administration import superseded_calibrations
 from skindb.workflow.audit import logged_action
 from skindb.workflow.derive import code_digest, groups_of
 
-NOTE = "stage"  # file in the scratch folder: path of the data that this run writes
 RIG = "rig_calibration"  # group of a calibration from takes
 # group of a calibration -> function that applies it to a dome
 APPLIED: dict[str, Callable[..., DomeRecord]] = {
@@ -207,19 +205,14 @@ def _ingest(
             ingest_capture(
                 capture, parameters, scratch=scratch.parent, progress=progress
             ) as tree,
+            db.stage("capture", capture.take, lease) as stage,
         ):
-            _discard_left(db, capture.take, scratch / NOTE)
-            with db.stage("capture", capture.take, lease) as stage:
-                if scratch.is_dir():
-                    private_file(scratch / NOTE).write_text(
-                        stage.path, encoding="utf-8"
-                    )
-                stage.write(groups_of(tree))
-                if progress is not None:
-                    progress("write", 1, 1)
-                provenance = {str(name): value for name, value in tree.attrs.items()}
-                digest = {"code_digest": _ingest_digest()}
-                return stage.commit(provenance | digest)
+            stage.write(groups_of(tree))
+            if progress is not None:
+                progress("write", 1, 1)
+            provenance = {str(name): value for name, value in tree.attrs.items()}
+            digest = {"code_digest": _ingest_digest()}
+            return stage.commit(provenance | digest)
 
 
 def _ingest_digest() -> str:
@@ -244,14 +237,6 @@ def _require_admitted(db: Database, take: str, scratch: Path) -> None:
                 "if the subject consented again, give it a new pseudonym",
             )
         )
-
-
-def _discard_left(db: Database, take: str, note: Path) -> None:
-    """Remove the data that a killed run of this very ingest had begun to write."""
-    # a damaged note or log: nothing is removed then
-    with suppress(InputError, OSError, UnicodeDecodeError):
-        if not note.is_symlink():
-            db.discard("capture", take, note.read_text(encoding="utf-8"))
 
 
 def calibrate(

@@ -446,7 +446,7 @@ def test_ingest_capture__survives_a_kill_without_goodbye(
     pristine, tmp_path, monkeypatch, whole, point
 ):
     """No `finally` is run: the lock falls with the process, the journal says what is
-    done, written data are removed.
+    done, written data are garbage.
     """
     folder = tmp_path / "db"
     assert (
@@ -467,43 +467,11 @@ def test_ingest_capture__survives_a_kill_without_goodbye(
     found = db.read("capture", "T001")["samples"]
     for name, values in found.data_vars.items():
         np.testing.assert_array_equal(values.values, whole["samples"][name].values)
-    assert len(list((folder / "data/capture/T001").glob("*.zarr"))) == 1
+    versions = {path.stem for path in (folder / "data/capture/T001").glob("*.zarr")}
+    garbage = {Path(one.key).stem for one in db.garbage()}
+    assert len(versions - garbage) == 1
+    assert len(versions) == (1 if point == "sample" else 2)
     assert db.verify() == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "planted",
-    [
-        "../victim",
-        "{tmp}/victim",
-        "data/capture/OTHER/x.zarr",
-        "data/capture/T001/../../../../victim",
-        "\x00",
-        "",
-    ],
-)
-def test_ingest_take__a_planted_note_removes_nothing(pristine, tmp_path, planted):
-    """What a killed ingest left may have been changed: nothing but data of this take
-    that no record names may go.
-    """
-    db = Database(tmp_path / "db")
-    victims = [tmp_path / "victim/file", tmp_path / "db/data/capture/OTHER/x.zarr/file"]
-
-    def killer(stage, step, _):
-        if (stage, step) == ("sample", 8):
-            raise Killed
-
-    with pytest.raises(Killed):
-        ingest_take(db, pristine, spacing_mm=8.0, progress=killer)
-    for victim in victims:
-        victim.parent.mkdir(parents=True)
-        victim.touch()
-    (scratch,) = (tmp_path / "db/tmp").iterdir()
-    (scratch / "stage").write_text(planted.format(tmp=tmp_path))
-    ingest_take(db, pristine, spacing_mm=8.0)
-    assert all(victim.exists() for victim in victims)
-    assert db.takes() == ["T001"]
 
 
 @pytest.mark.slow

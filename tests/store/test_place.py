@@ -103,21 +103,3 @@ def test_sizes__links_and_loops_are_no_files(place):
 def test_remove_version__removes_versions_only(place, path):
     with pytest.raises(InputError, match=r"path of a version: must match|stay inside"):
         remove_version(place, path)
-
-
-def test_discard__leaves_what_the_log_names(tmp_path):
-    record = commit(tmp_path)
-    db = Database(tmp_path)
-    db.discard("capture", "A1", record.path)
-    assert db.verify() == []
-    for path in (
-        "data/capture/A2/20260101T000000-0123abcd.zarr",
-        "../victim",
-        "data/model/A1/x",
-    ):
-        with pytest.raises(InputError, match="must be the path of a capture of A1"):
-            db.discard("capture", "A1", path)
-    left = tmp_path / "data/capture/A1/20260101T000000-0123abcd.zarr"
-    left.mkdir()
-    db.discard("capture", "A1", left.relative_to(tmp_path).as_posix())
-    assert not left.exists()

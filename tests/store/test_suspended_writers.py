@@ -20,6 +20,7 @@ from skindb.store import lease as lease_module
 from skindb.store import stage as stage_module
 from skindb.store.bucket import Bucket
 from skindb.store.folder import Folder
+from skindb.store.log import Log
 from skindb.store.markers import WithdrawalGuard, WithdrawnError
 
 SUBJECT = "Xqz7"
@@ -296,7 +297,9 @@ def test_late_commit__is_named_by_verify_and_removed_by_clean(late):
         for fault in late.verify()
         if fault.rule == "nothing of a withdrawn subject must remain"
     }
-    assert {f"capture of {SUBJECT}.lotion", "population 2 of traits"} <= places
+    study = Log(late.place, "population", "traits")._read(2).path
+    keys = (f"data/capture/{SUBJECT}.lotion", study)
+    assert {late.place.where(key) for key in keys} <= places
     late.clean()
     assert late.verify() == []
     assert _keys_with(late, SUBJECT) == []
