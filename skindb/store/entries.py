@@ -1,18 +1,17 @@
 """Blocks of the cache of records, which hold the parts of records that queries need.
 
-A block, `catalogue/<digest>.json`, is named after its content and never changes. A query
-that had to read records writes them in a new block together with the blocks that are
-not much larger, which it then removes: a row is written again few times, and there are
-few blocks. No lock is needed, as by SQLite on a folder that machines share: an entry
-counts only while the files that it was read from are the same.
+A block, `catalogue/<digit>.block`, has the records of the takes whose digests begin with
+this digit. A query that had to read records writes their blocks again. No lock is needed,
+as by SQLite on a folder that machines share: of two queries that write a block, one is
+repeated later, and an entry counts only while the files that it was read from are the
+same.
 """
 
 import gc
 import hashlib
 import json
-import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -20,17 +19,12 @@ from typing import Any, TypeVar
 
 from skindb.schema.consent import CONSENT
 from skindb.store.place import Place, in_parallel
-from skindb.store.record import Key, Record, intact_or_none
+from skindb.store.record import Record, intact_or_none
 
 CATALOGUE = "catalogue"
-CATALOGUE_BLOCK = r"[0-9a-f]{64}\.json"
-BLOCK_FORMAT = 6
-# a withdrawal removes the blocks with its subject, whose other rows are read again
-MAX_BLOCK_ROWS = 2048
-# a block of at most this many times the new rows is merged with them
-MERGE_RATIO = 4
-# to read all blocks while other queries merge some of them
-MAX_LISTINGS = 3
+CATALOGUE_BLOCK = r"[0-9a-f]\.block"
+BLOCK_FORMAT = 7
+DIGEST_BYTES = 32  # before the content of a file of a cache
 # parts of a provenance that are equal in many records
 SHARED_PARTS = (
     "schema_version",
@@ -119,17 +113,27 @@ def read_cache(
     place: Place, folder: str, read: Callable[[str], T | None]
 ) -> dict[str, T | None]:
     """Key of every file of a cache -> what is read from it; None if it is damaged or
-    foreign. Files that are written or removed meanwhile are not included.
+    foreign. Files that are removed meanwhile are not included.
     """
-    blocks: dict[str, T | None] = {}
     keys = block_keys(place, folder)
-    for _ in range(MAX_LISTINGS):
-        blocks = dict(zip(keys, in_parallel(read, keys), strict=True))
-        damaged = {key for key, block in blocks.items() if block is None}
-        keys = block_keys(place, folder) if damaged else keys
-        if damaged <= {*keys}:
-            break
+    blocks = dict(zip(keys, in_parallel(read, keys), strict=True))
+    if None in blocks.values():
+        keys = block_keys(place, folder)
     return {key: b for key, b in blocks.items() if b is not None or key in keys}
+
+
+def packed(key: str, content: bytes) -> bytes:
+    """Content of a file of a cache, with a digest by which a damaged file, or that of
+    another key, is detected.
+    """
+    return hashlib.sha256(key.encode() + b"\0" + content).digest() + content
+
+
+def unpacked(key: str, content: bytes) -> bytes:
+    """What was packed; `ValueError` if the file is damaged."""
+    if packed(key, content[DIGEST_BYTES:]) != content:
+        raise ValueError("content that does not match its digest")
+    return content[DIGEST_BYTES:]
 
 
 def read_blocks(place: Place) -> dict[str, list[Entry] | None]:
@@ -152,43 +156,17 @@ def catalogue_blocks_of(place: Place, is_named: Callable[[str], bool]) -> list[s
     ]
 
 
-def blocks_to_merge(blocks: Mapping[str, Sequence[Key]], rows: int) -> list[str]:
-    """Blocks to write again with this number of new rows, the smallest first."""
-    merged = []
-    for key in sorted(blocks, key=lambda key: len(blocks[key])):
-        size = len(blocks[key])
-        if size > min(MERGE_RATIO * rows, MAX_BLOCK_ROWS // 2):
-            break
-        merged.append(key)
-        rows += size
-    return merged
-
-
-def write_blocks(
-    place: Place, entries: Iterable[Entry], guard: Callable[[str], None]
-) -> dict[str, list[Key]]:
-    """Write blocks; returns the keys of their entries. The guard is called with the key
-    of each block, see `Place.replace`.
-    """
-    # takes together, so that few blocks name a subject
-    rows = sorted(entries, key=lambda entry: (entry.record.take, entry.record.key))
-    count = math.ceil(len(rows) / MAX_BLOCK_ROWS)
-    written = {}
-    for number in range(count):
-        start = number * len(rows) // count
-        part = rows[start : (number + 1) * len(rows) // count]
-        content = _content(part)
-        key = f"{CATALOGUE}/{hashlib.sha256(content).hexdigest()}.json"
-        place.replace(key, content, guard=partial(guard, key))
-        written[key] = [entry.record.key for entry in part]
-    return written
+def block_of(take: str) -> str:
+    """Key of the block with the records of a take."""
+    return f"{CATALOGUE}/{hashlib.sha256(take.encode()).hexdigest()[0]}.block"
 
 
 def _chosen(values: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
     return {name: values[name] for name in names if name in values}
 
 
-def _content(entries: Iterable[Entry]) -> bytes:
+def block_content(key: str, entries: Iterable[Entry]) -> bytes:
+    """Content of the file of a block."""
     shared: dict[str, int] = {}
 
     def index(value: Any) -> int:
@@ -204,15 +182,12 @@ def _content(entries: Iterable[Entry]) -> bytes:
         rows.append([fields, own, *map(index, parts), entry.file, entry.head])
     values = [json.loads(text) for text in shared]
     body = {"format": BLOCK_FORMAT, "shared": values, "rows": rows}
-    return json.dumps(body, separators=(",", ":")).encode()
+    return packed(key, json.dumps(body, separators=(",", ":")).encode())
 
 
 def _read_block(place: Place, key: str) -> list[Entry] | None:
     def read() -> list[Entry] | None:
-        content = place.read_small(key)
-        if key != f"{CATALOGUE}/{hashlib.sha256(content).hexdigest()}.json":
-            return None
-        body = json.loads(content)
+        body = json.loads(unpacked(key, place.read_small(key)))
         if body["format"] != BLOCK_FORMAT:
             return None
         shared = body["shared"]

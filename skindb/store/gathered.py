@@ -23,7 +23,7 @@ from skindb.errors import InputError, input_error, require
 from skindb.schema.cohort import TAKE, Held, Values, combine, values_of
 from skindb.schema.variables import VARIABLES
 from skindb.store.bucket import place_at
-from skindb.store.entries import read_cache
+from skindb.store.entries import packed, read_cache, unpacked
 from skindb.store.log import RESTORE, committed_logs
 from skindb.store.markers import read_markers
 from skindb.store.place import Place, subject_of
@@ -36,7 +36,6 @@ BLOCK_NAME = r"[0-9a-f]{64}\.npz"
 BLOCK_KEY = rf"{GATHERED}/{BLOCK_NAME}"
 GATHERED_TAKES = 256  # in a block, on average
 SEAL = "seal"  # of the version of each take in a block
-DIGEST_BYTES = 32  # before the content of a block
 # cached by a process; the tables of a take have some 20 kB, blocks 3 kB for each take
 MAX_OPEN_TABLES = 2048
 MAX_OPEN_BLOCKS = 64
@@ -186,20 +185,13 @@ def _packed(key: str, block: xr.Dataset) -> bytes:
             arrays[name] = np.array(values.tolist(), "U")
     content = io.BytesIO()
     np.savez(content, allow_pickle=False, **arrays)
-    return _digest(key, content.getvalue()) + content.getvalue()
-
-
-def _digest(key: str, content: bytes) -> bytes:
-    """Digest by which a damaged block, or that of other versions, is detected."""
-    return hashlib.sha256(key.encode() + b"\0" + content).digest()
+    return packed(key, content.getvalue())
 
 
 def _stored(place: Place, key: str) -> xr.Dataset:
     """The block in a file; `ValueError` if the file is damaged."""
-    content = place.read(key)
-    if _digest(key, content[DIGEST_BYTES:]) != content[:DIGEST_BYTES]:
-        raise ValueError("content that does not match its digest")
-    with np.load(io.BytesIO(content[DIGEST_BYTES:]), allow_pickle=False) as arrays:
+    content = unpacked(key, place.read(key))
+    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
         values = {name: arrays[name] for name in arrays.files}
     coords = {name: values.pop(name) for name in [*values] if name not in VARIABLES}
     coords[SEAL] = (TAKE, coords[SEAL])

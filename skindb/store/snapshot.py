@@ -19,11 +19,11 @@ from skindb.errors import Fault, InputError, input_error
 from skindb.schema.consent import CONSENT, consent_scope
 from skindb.store.entries import (
     Entry,
-    blocks_to_merge,
+    block_content,
+    block_of,
     collection_paused,
     read_blocks,
     trimmed_record,
-    write_blocks,
 )
 from skindb.store.log import GENERATION, Log
 from skindb.store.markers import Markers, WithdrawnError, read_markers
@@ -320,11 +320,8 @@ class RecordCache:
         self._markers = markers.result()
         self.snapshot = Snapshot(place, self._markers)
         self._entries: dict[Key, Entry] = {}
-        # key of each block -> its entries that are still valid; none if it is damaged
-        self._blocks = {
-            key: self._add_entries(entries or ())
-            for key, entries in blocks.result().items()
-        }
+        for entries in blocks.result().values():
+            self._add_entries(entries or ())
         self._new: set[Key] = set()  # entries that no block holds
         # kind and take -> generations in ascending order
         self._generations: dict[tuple[str, str], list[int]] = {}
@@ -334,17 +331,14 @@ class RecordCache:
         for kind, take in (*self._generations, *self._heads):
             self._named.setdefault(kind, set()).add(take)
 
-    def _add_entries(self, entries: Iterable[Entry]) -> list[Key]:
+    def _add_entries(self, entries: Iterable[Entry]) -> None:
         """Add the entries of a block whose files have not changed."""
-        added = []
         for entry in entries:
             key = entry.record.key
             if self._files.get(key) == entry.file:
-                added.append(key)
                 head = self._heads.get(key[:2], "")
                 if key not in self._entries or entry.head == head:
                     self._entries[key] = entry
-        return added
 
     def kinds(self) -> list[str]:
         """Kinds of the versions of all takes, without the transient kinds."""
@@ -405,23 +399,19 @@ class RecordCache:
         """
         if not self._new:
             return
-        merged = blocks_to_merge(self._blocks, len(self._new))
-        keys = self._new.union(*(self._blocks[block] for block in merged))
         listed = list_records(self.place)
-        entries = [
-            entry
-            for entry in map(self._entries.__getitem__, keys)
-            if self._markers.admits(entry.record)
-            and listed.get(entry.record.key) == entry.file
-        ]
+        blocks: dict[str, list[Entry]] = {
+            block_of(take): [] for _, take, _ in self._new
+        }
+        for key, entry in self._entries.items():
+            is_present = listed.get(key) == entry.file
+            if is_present and self._markers.admits(entry.record):
+                blocks.get(block_of(key[1]), []).append(entry)
         # for example a read-only folder: the next query reads the log again
         with suppress(OSError, InputError):
-            guard = partial(require_same_markers, self.place, self._markers)
-            written = write_blocks(self.place, entries, guard)
-            for block in {*merged} - written.keys():
-                self.place.remove(block)
-                del self._blocks[block]
-            self._blocks |= written
+            for block, rows in blocks.items():
+                guard = partial(require_same_markers, self.place, self._markers, block)
+                self.place.replace(block, block_content(block, rows), guard=guard)
             self._new = set()
 
     def _entry(self, kind: str, take: str, generation: int | None) -> Entry | None:

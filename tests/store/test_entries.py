@@ -11,7 +11,7 @@ from stored import commit
 
 import skindb
 from skindb.errors import InputError
-from skindb.store import entries
+from skindb.store import entries, snapshot
 from skindb.store.erasure import erase
 from skindb.store.log import Log
 
@@ -29,46 +29,55 @@ def _blocks(db):
     return sorted((db.root / "catalogue").iterdir())
 
 
-def test_blocks_to_merge__few_blocks_and_few_rows_written_again():
-    blocks = {}
-    written = 0
-    most_blocks = 0
-    takes = 3000
-    for number in range(takes):
-        row = ("model", f"P{number}", 1)
-        merged = entries.blocks_to_merge(blocks, 1)
-        rows = [row, *(key for name in merged for key in blocks.pop(name))]
-        blocks[str(number)] = rows
-        written += len(rows)
-        most_blocks = max(most_blocks, len(blocks))
-    assert sum(map(len, blocks.values())) == takes
-    assert most_blocks <= 9
-    assert written < 14 * takes
+def _block(db, take):
+    return db.root / entries.block_of(take)
 
 
-def test_save__a_commit_leaves_large_blocks_alone(db):
+def test_save__a_commit_changes_the_block_of_its_take_only(db):
     for number in range(8):
         commit(db.root, take=f"E{number}", **SCOPE)
     db.table()
-    [large] = _blocks(db)
-    content = large.read_bytes()
+    others = {
+        file: file.stat().st_ino for file in _blocks(db) if file != _block(db, "A1")
+    }
+    assert len(others) > 2
     for generation in (2, 3):
         commit(db.root, take="A1", **SCOPE)
         assert db.table().capture_generation["A1"] == generation
-        assert large.read_bytes() == content
-        assert len(_blocks(db)) == 2
+        assert {file: file.stat().st_ino for file in others} == others
+
+
+def test_save__of_two_queries_keeps_a_block_whole(db):
+    """The entries of one are missing, and read again."""
+    one, other = (skindb.open(db.url) for _ in range(2))
+    content = entries.block_content
+
+    def slower(key, rows):
+        with mock.patch.object(snapshot, "block_content", content):
+            other.table()
+        return content(key, rows)
+
+    with mock.patch.object(snapshot, "block_content", slower):
+        one.table()
+    commit(db.root, take="A1", **SCOPE)
+    assert db.table().capture_generation["A1"] == 2
+    assert db.verify() == []
 
 
 def test_erase__removes_only_the_blocks_with_the_subject(db):
-    with mock.patch.object(entries, "MAX_BLOCK_ROWS", 2):
-        db.table()
+    db.table()
     kept = [file for file in _blocks(db) if b"B2" not in file.read_bytes()]
-    assert len(kept) == 1
+    together = {
+        take
+        for take in ("A1", "C3", "D4")
+        if entries.block_of(take) == entries.block_of("B2")
+    }
+    assert len(kept) == len(_blocks(db)) - 1 > 0
     erase(db.place, "B2")
     assert _blocks(db) == kept
     with mock.patch.object(Log, "_read", autospec=True, side_effect=Log._read) as read:
         assert list(db.table().index) == ["A1", "C3", "D4"]
-    assert [call.args[0].take for call in read.call_args_list] == ["A1"]
+    assert {call.args[0].take for call in read.call_args_list} == together
     assert not [file for file in _blocks(db) if b"B2" in file.read_bytes()]
     assert db.verify() == []
 
@@ -86,33 +95,14 @@ def test_save__foreign_files_are_left_to_verify(db):
     assert not foreign.exists()
 
 
-def test_read_blocks__that_another_query_merges_meanwhile(db):
+def test_read_blocks__that_a_withdrawal_removes_meanwhile(db):
     db.table()
-    [key] = entries.block_keys(db.place, "catalogue")
-    listings = [[f"catalogue/{'0' * 64}.json", key], [key]]
+    keys = entries.block_keys(db.place, "catalogue")
+    listings = [["catalogue/x.block", *keys], keys]
     with mock.patch.object(entries, "block_keys", side_effect=listings):
-        [rows] = entries.read_blocks(db.place).values()
-    assert [row.record.take for row in rows] == ["A1", "B2", "C3", "D4"]
-
-
-def test_verify__while_a_query_writes_a_block(db):
-    erase(db.place, "B2")
-    for number in range(8):
-        commit(db.root, take=f"E{number}", **SCOPE)
-    db.table()
-    new_takes = ["F1"]
-
-    def listed(place, folder):
-        keys = block_keys(place, folder)
-        if folder == "catalogue" and new_takes:
-            commit(db.root, take=new_takes.pop(), **SCOPE)
-            db.table()
-        return keys
-
-    block_keys = entries.block_keys
-    with mock.patch.object(entries, "block_keys", listed):
-        assert db.verify() == []
-    assert len(_blocks(db)) == 2
+        blocks = entries.read_blocks(db.place)
+    rows = [row for block in blocks.values() for row in block]
+    assert sorted(row.record.take for row in rows) == ["A1", "B2", "C3", "D4"]
 
 
 def test_erase__an_unknown_subject_beside_a_block_that_cannot_be_read(db):
