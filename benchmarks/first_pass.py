@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import tempfile
 import time
+from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -19,7 +20,7 @@ from planted_skin import capture_of, make_skin
 
 from skindb.store import Database
 from skindb.workflow import fit as fit_module
-from skindb.workflow.derive import FIRST_PASS, groups_of
+from skindb.workflow.derive import groups_of
 
 TAKE = "S01"
 
@@ -28,11 +29,11 @@ def main(*, surfels: int = 16384, repeat: int = 3) -> None:
     seconds: dict[str, list[float]] = {"keep": [], "first pass": [], "fit": []}
     keep = fit_module._store_first_pass
 
-    def timed(*args: Any) -> None:
+    def timed(scratch: Path, *args: Any) -> None:
         begin = time.perf_counter()
-        keep(*args)
+        keep(scratch, *args)
         seconds["keep"].append(time.perf_counter() - begin)
-        size.append(db.record(FIRST_PASS, TAKE).bytes)
+        size.append(Database(scratch).record("model", TAKE).bytes)
 
     size: list[int] = []
     fit_module._store_first_pass = timed

@@ -45,7 +45,7 @@ from skindb.store.markers import (
     note_withdrawals,
     read_markers,
 )
-from skindb.store.place import KINDS_OF_ONE_SUBJECT, RELEASE, TRANSIENT, Place
+from skindb.store.place import KINDS_OF_ONE_SUBJECT, RELEASE, Place
 from skindb.store.record import Record, damage_as_fault
 from skindb.store.stale import REQUESTS, read_requests
 from skindb.store.verified import AS_COMMITTED, CHANGED, CURE, read_manifest
@@ -295,11 +295,7 @@ def _erased_states(
 def _draft(place: Place, markers: Markers) -> Draft:
     """The state of a database at one moment, without withdrawn subjects."""
     listing = _list_twice(place)
-    keys = [
-        key
-        for key in sorted(listing)
-        if (match := RECORD_KEY.fullmatch(key)) and match[1] not in TRANSIENT
-    ]
+    keys = [key for key in sorted(listing) if RECORD_KEY.fullmatch(key)]
     faults: list[Fault] = []
     readable = dict(intact(partial(read_record, place), keys, faults))
     tombstones = [key for key in listing if key.startswith("tombstones/")]

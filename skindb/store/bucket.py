@@ -241,8 +241,7 @@ class Bucket:
         finally:
             self.remove(key)
 
-    # objects are always durable
-    def make_durable(self, key: str, *, flush: bool = True) -> None:  # noqa: ARG002
+    def make_durable(self, key: str) -> None:
         """Write pending metadata, and check that every object is stored as it was acknowledged."""
         names = [f"{key}/{name}" for name in self.pending(key)]
         in_parallel(lambda name: self.write(name, self._pending.pop(name)), names)

@@ -120,7 +120,7 @@ class Database:
         return Snapshot(self.place).has(kind, take)
 
     def kinds(self, take: str | None = None) -> list[str]:
-        """Kinds of the versions of one take or of all takes, without the transient kinds."""
+        """Kinds of the versions of one take or of all takes."""
         return Snapshot(self.place).kinds(take)
 
     def takes(
@@ -544,12 +544,6 @@ class Database:
     def fulfil(self, request: Request) -> None:
         """Remove a request, because its result was computed."""
         remove_request(self.place, request)
-
-    def forget(self, kind: str, take: str) -> None:
-        """Remove all versions of a transient kind, such as the first pass of a fit,
-        without a tombstone.
-        """
-        Log(self.place, kind, take).forget()
 
     def info(
         self,

@@ -31,7 +31,6 @@ from skindb.store.place import (
     SUMMARY,
     TAKE,
     TIME_HEX,
-    TRANSIENT,
     Place,
     UnavailableError,
     in_parallel,
@@ -55,7 +54,7 @@ FOLDERS_WITH_TAKES = ("log", "data", "heads", "leases")
 REMOVAL_ORDER = ("edit", STUDY, RELEASE, SUMMARY, "registration")
 REGISTRATION = "registration"
 SUBJECT = r"[A-Za-z0-9_-]{1,64}"
-# name of the scratch folder of an ingest
+# name of the scratch folder of an ingest, and of the first pass of a fit
 SCRATCH_NAME = re.compile(rf"({TAKE})-[0-9a-f]{{16}}")
 # end of the name of a scratch folder whose removal was interrupted
 ABANDONED_SCRATCH = ".gone"
@@ -342,7 +341,7 @@ def _remove_record(place: Place, record: Record) -> None:
 
 
 def _count(place: Place, kind: str, take: str) -> int:
-    return 0 if kind in TRANSIENT else len(Log(place, kind, take).generations())
+    return len(Log(place, kind, take).generations())
 
 
 def _every_record(place: Place) -> list[Record]:

@@ -158,20 +158,16 @@ class Folder:
         finally:
             temporary.unlink(missing_ok=True)
 
-    def make_durable(self, key: str, *, flush: bool = True) -> None:
-        """Flush the files below a key and its parent folders to the disk, which zarr does not do.
-
-        Without `flush` only the permissions of the files are set.
-        """
+    def make_durable(self, key: str) -> None:
+        """Flush the files below a key and its parent folders, which zarr does not do."""
         place = inside(self.root, key)
         # zarr creates files and folders with the permissions of the umask
         folders, files = self._modes()
         for folder, _, names in os.walk(place, topdown=False):
             for name in names:
-                flush_path(Path(folder) / name, mode=files, flush=flush)
-            flush_path(Path(folder), mode=folders, flush=flush)
-        if flush:
-            self._flush_parents(place)
+                flush_path(Path(folder) / name, mode=files)
+            flush_path(Path(folder), mode=folders)
+        self._flush_parents(place)
 
     def create(
         self,
@@ -375,13 +371,12 @@ def remove_tree(place: Path) -> None:
             return
 
 
-def flush_path(path: Path, *, mode: int | None = None, flush: bool = True) -> None:
+def flush_path(path: Path, *, mode: int | None = None) -> None:
     """Flush a file or folder to the disk, and set its permissions if a mode is given."""
     handle = os.open(path, os.O_RDONLY)
     try:
         if mode is not None:
             os.fchmod(handle, mode)
-        if flush:
-            os.fsync(handle)
+        os.fsync(handle)
     finally:
         os.close(handle)

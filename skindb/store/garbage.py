@@ -19,11 +19,9 @@ from skindb.store.log import Log, committed_logs, takes_below
 from skindb.store.markers import Markers, read_markers
 from skindb.store.place import (
     CALIBRATION,
-    LEASE_KINDS,
     RELEASE,
     STAGING,
     TIME_HEX,
-    TRANSIENT,
     Place,
 )
 from skindb.store.record import Key, Record
@@ -33,8 +31,6 @@ from skindb.store.verify import may_have_had_record, partly_removed_records, tom
 STILL_WRITING_SECONDS = 3600.0  # newer files may belong to a run without a lease
 KEPT_BLOCK_SECONDS = 24 * 3600.0
 KEPT_KINDS = (CONSENT, RELEASE, CALIBRATION)  # kinds of which all generations are kept
-# equal in a first pass and its model
-FIT_IDENTITY = ("inputs", "requested", "dictionary_digest", "code_digest")
 VERSION_FILE = re.compile(rf"({TIME_HEX})\.(zarr|(manifest|tables|names)\.json)")
 OF_WITHDRAWN = "it is of a withdrawn subject, or refers to one"
 Clock = Callable[[], float]
@@ -113,7 +109,7 @@ def remove_garbage(place: Place, generations: int | None = None) -> list[Garbage
 
 def _required_leases(kind: str, take: str) -> tuple[tuple[str, ...], str]:
     """Kinds and take of the leases that a writer of these files may hold."""
-    if kind in ("capture", "model", *LEASE_KINDS):
+    if kind in ("capture", "model"):
         return ("capture", "model"), take
     return ((kind,) if kind else ()), take
 
@@ -125,10 +121,6 @@ def _remove_one(place: Place, item: Garbage) -> bool:
         return True
     if item.generation:
         Log(place, kind, take).remove(item.generation)
-    elif (
-        kind in TRANSIENT and item.key.startswith("log/") and item.key.endswith(".json")
-    ):
-        Log(place, kind, take).forget()
     elif item.key.endswith(".zarr"):
         records, faults = Log(place, kind, take).faults()
         # committed meanwhile
@@ -151,9 +143,6 @@ def _unrecorded(
     names = place.children(key)
     log = Log(place, kind, take)
     records, faults = log.faults()
-    if kind in TRANSIENT:
-        yield _first_pass(place, log, records, now)
-        return
     for record in partly_removed_records(log, records, tombstone_names):
         description = f"generation {record.generation}, whose removal was interrupted"
         reason = _in_use_reason(place, kind, take)
@@ -193,32 +182,8 @@ def _unrecorded(
         )
 
 
-def _first_pass(place: Place, log: Log, records: list[Record], now: Clock) -> Garbage:
-    """The first pass of a fit that was committed, or of a killed fit that can be resumed."""
-    data = f"data/{log.kind}/{log.take}"
-    description = "the first pass of a killed fit"
-    reason = _in_use_reason(place, log.kind, log.take)
-    if records and _has_model(place, records[-1]):
-        description = "the first pass of a fit that was committed"
-    elif records:
-        reason = reason or _recent_reason(place, [data], now, RESUMABLE_SECONDS)
-    elif not abandoned_holder(place, LEASE_KINDS[log.kind], log.take):
-        reason = reason or _recent_reason(place, [data], now)
-    size = _bytes_below(place, data)
-    return Garbage(f"{log.key}/00000001.json", description, size, reason)
-
-
-def _has_model(place: Place, first_pass: Record) -> bool:
-    fit = Log(place, LEASE_KINDS[first_pass.kind], first_pass.take)
-    model = {} if fit.is_empty() else fit.read().provenance
-    return all(
-        name in model and model[name] == first_pass.provenance.get(name)
-        for name in FIT_IDENTITY
-    )
-
-
 def _in_use_reason(place: Place, kind: str, take: str) -> str:
-    holder = holder_of(place, LEASE_KINDS.get(kind, kind), take)
+    holder = holder_of(place, kind, take)
     return f"in use by {holder}" if holder else ""
 
 
@@ -275,17 +240,19 @@ def _unneeded_blocks(place: Place, now: Clock) -> Iterator[Garbage]:
 
 
 def _scratch_folders(place: Place, now: Clock) -> Iterator[Garbage]:
-    """Scratch folders of killed ingests."""
+    """Scratch folders of killed ingests, and first passes of killed fits."""
     for name in place.children("tmp") if place.file_type("tmp") == "folder" else []:
         key = f"tmp/{name}"
         size = _bytes_below(place, key)
         if match := SCRATCH_NAME.fullmatch(name):
-            reason = _in_use_reason(place, "capture", match[1]) or _recent_reason(
-                place, [key], now, RESUMABLE_SECONDS
+            reason = (
+                _in_use_reason(place, "capture", match[1])
+                or _in_use_reason(place, "model", match[1])
+                or _recent_reason(place, [key], now, RESUMABLE_SECONDS)
             )
         else:
             reason = _recent_reason(place, [key], now)
-        yield Garbage(key, "scratch files of a killed ingest", size, reason)
+        yield Garbage(key, "scratch files of a killed run", size, reason)
 
 
 def _abandoned_leases(

@@ -22,7 +22,6 @@ from skindb.store.markers import WithdrawnError
 from skindb.store.place import (
     KIND,
     TAKE,
-    TRANSIENT,
     Guard,
     Place,
     UnavailableError,
@@ -136,8 +135,7 @@ class Log:
                     "run the command again",
                 )
             )
-        if self.kind not in TRANSIENT:
-            self._write_head(record.generation, seal, guard)
+        self._write_head(record.generation, seal, guard)
         return replace(record, seal=seal)
 
     def remove(self, generation: int) -> None:
@@ -155,19 +153,6 @@ class Log:
             record.beside("names"),
             self.record_key(generation),
         ):
-            self.place.remove(key)
-
-    def forget(self) -> None:
-        """Remove all versions of a transient kind, including those of killed writers,
-        without a tombstone.
-        """
-        if self.kind not in TRANSIENT:
-            raise ValueError(
-                f"{self.what} must be removed by `remove`, because the kind "
-                f"{self.kind} is not transient"
-            )
-        # the record first, so that it never names a missing version
-        for key in (self.key, f"data/{self.kind}/{self.take}"):
             self.place.remove(key)
 
     def faults(self) -> tuple[list[Record], list[Fault]]:
@@ -379,8 +364,7 @@ def tombstone_content(record: Record) -> bytes:
 def committed_logs(place: Place) -> Iterator[Log]:
     """The logs of all kinds and takes, including those for which only a head exists."""
     for kind, take in sorted({*takes_below(place, "log"), *takes_below(place, HEADS)}):
-        if kind not in TRANSIENT:
-            yield Log(place, kind, take)
+        yield Log(place, kind, take)
 
 
 def takes_below(place: Place, key: str) -> Iterator[tuple[str, str]]:

@@ -27,7 +27,7 @@ SUMMARY = "summary"
 KINDS_WITHOUT_SUBJECT = (STUDY, RELEASE, CALIBRATION)
 # kinds that hold data of their own subject only; an input of them is of that subject,
 # or a product that many share
-KINDS_OF_ONE_SUBJECT = ("capture", "first", "model", "consent")
+KINDS_OF_ONE_SUBJECT = ("capture", "model", "consent")
 TAKE = r"[A-Za-z0-9_-]{1,64}(\.[A-Za-z0-9_-]{1,64})?"
 KIND = r"[a-z]{1,32}"
 GROUP = r"[a-z_]{1,32}"
@@ -35,10 +35,6 @@ GROUP = r"[a-z_]{1,32}"
 TIME_HEX = r"[0-9]{8}T[0-9]{6}-[0-9a-f]{8}"
 STAGING = "staging"  # folder for temporary files of writers
 AUDIT = "audit"  # folder of the audit log
-# kinds of intermediate results of a run, removed when its result is committed
-TRANSIENT = ("first",)
-# kind -> kind of the lease under which it is written, if it differs
-LEASE_KINDS = {"first": "model"}
 VERSION = rf"data/{KIND}/{TAKE}/{TIME_HEX}\.zarr"
 Guard = Callable[[], None]  # raises if a file must not be written any more
 # that read small files; a bucket takes some 20 ms per file, whatever its size
@@ -236,10 +232,8 @@ class Place(Protocol):
     def now(self) -> float:
         """Time of the clock of the storage, which is the same for all machines that share it."""
 
-    def make_durable(self, key: str, *, flush: bool = True) -> None:
-        """Return when everything below a key survives a power loss; without `flush`,
-        when other processes see it.
-        """
+    def make_durable(self, key: str) -> None:
+        """Return when everything below a key survives a power loss."""
 
     def create(
         self,

@@ -32,7 +32,6 @@ from skindb.store.place import (
     KINDS_WITHOUT_SUBJECT,
     RELEASE,
     TAKE,
-    TRANSIENT,
     Located,
     Place,
     in_parallel,
@@ -63,8 +62,8 @@ class Snapshot:
         self.markers = read_markers(place) if markers is None else markers
 
     def kinds(self, take: str | None = None) -> list[str]:
-        """Kinds of the versions of one take or of all takes, without the transient kinds."""
-        names = {*self.place.children("log"), *self._head_names("")} - {*TRANSIENT}
+        """Kinds of the versions of one take or of all takes."""
+        names = {*self.place.children("log"), *self._head_names("")}
         kinds = [name for name in sorted(names) if re.fullmatch(KIND, name)]
         takes = {kind: self.takes(kind) for kind in kinds}
         return [
@@ -341,9 +340,12 @@ class RecordCache:
                     self._entries[key] = entry
 
     def kinds(self) -> list[str]:
-        """Kinds of the versions of all takes, without the transient kinds."""
-        named = sorted(self._named.keys() - {*TRANSIENT})
-        return [kind for kind in named if re.fullmatch(KIND, kind) and self.takes(kind)]
+        """Kinds of the versions of all takes."""
+        return [
+            kind
+            for kind in sorted(self._named)
+            if re.fullmatch(KIND, kind) and self.takes(kind)
+        ]
 
     def takes(self, kind: str) -> list[str]:
         """Takes with a version of this kind, including those whose records were lost."""

@@ -35,7 +35,6 @@ from skindb.store.place import (
     GROUP,
     KINDS_OF_ONE_SUBJECT,
     TAKE,
-    TRANSIENT,
     VERSION,
     Place,
     UnavailableError,
@@ -219,8 +218,7 @@ class Stage:
         }
         with add_filename(self.place.where(self.path)):
             self._write_metadata(attrs)
-            # the data first, then the record; transient results need not survive a power loss
-            self.place.make_durable(self.path, flush=self.log.kind not in TRANSIENT)
+            self.place.make_durable(self.path)  # the data first, then the record
         files = self._written_files()
         record = Record(
             kind=self.log.kind,

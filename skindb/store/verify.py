@@ -21,11 +21,9 @@ from skindb.store.place import (
     AUDIT,
     KIND,
     KINDS_OF_ONE_SUBJECT,
-    LEASE_KINDS,
     STAGING,
     TAKE,
     TIME_HEX,
-    TRANSIENT,
     Place,
     UnavailableError,
     in_parallel,
@@ -194,7 +192,7 @@ def _unrecorded_faults(
     faults = []
     for key in beside:
         _, kind, take, _ = key.split("/")
-        is_known = key in named or kind in TRANSIENT or f"{kind} of {take}" in damaged
+        is_known = key in named or f"{kind} of {take}" in damaged
         if not is_known and _has_lost_record(place, kind, take):
             faults.append(
                 Fault(
@@ -221,9 +219,7 @@ def _has_lost_record(place: Place, kind: str, take: str) -> bool:
 
 def may_have_had_record(log: Log) -> bool:
     """Whether a version without a record may have had a record."""
-    return not log.head() and not abandoned_holder(
-        log.place, LEASE_KINDS.get(log.kind, log.kind), log.take
-    )
+    return not log.head() and not abandoned_holder(log.place, log.kind, log.take)
 
 
 def version_faults(place: Place, record: Record) -> list[Fault]:

@@ -1,8 +1,8 @@
 """Versions that are derived from others: computed only if what is stored is not current.
 
 A version is current if it was derived from the same inputs, with the same parameters,
-by the same code. This is decided here for first passes, models, registrations,
-summaries, studies and edits.
+by the same code. This is decided here for models, registrations, summaries, studies
+and edits.
 
 The digest of the code covers the functions that are named and everything in skindb that
 they use: functions, classes and constants, followed through the imports of their modules.
@@ -39,9 +39,7 @@ DERIVED_FIELDS = ("ctx", "kind", "type_comment", "type_params")
 
 Symbol = tuple[str, str]  # module and name
 Reference = tuple[str, tuple[str, ...]]  # module and dotted names
-FIRST_PASS = "first"  # of a fit: transient, it is removed when the model is committed
 COMMANDS = {
-    FIRST_PASS: "fit",
     "model": "fit",
     "registration": "register",
     SUMMARY: "summarise",

@@ -1,8 +1,8 @@
 """From the capture of a take to a version of its model."""
 
+import shutil
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -13,12 +13,12 @@ from skindb.errors import InputError, input_error
 from skindb.fit import FitParameters, FitPlan, first_pass, plan_fit, second_pass
 from skindb.reflectance.brdf_files import read_dictionary
 from skindb.reflectance.dictionary import EMBEDDED, Dictionary, embedded_dictionary
-from skindb.store import Database, Lease, Record
+from skindb.store import Database, Record, seal_of, subject_of
 from skindb.threads import one_blas_thread
 from skindb.types import Progress
 from skindb.workflow.audit import logged
 from skindb.workflow.cohorts import model_with_summary, summary_parameters
-from skindb.workflow.derive import FIRST_PASS, Derivation, groups_of
+from skindb.workflow.derive import Derivation, groups_of
 
 EMBEDDED_NAME = "embedded"  # in place of a path
 METHOD = (first_pass, second_pass)  # functions that compute a model
@@ -78,24 +78,32 @@ def fit_take(
         db.require_consent(take, "fit")
         read = db.record("capture", take, capture.attrs["generation"])
         derivation = fit_derivation(db, read, requested, dictionary)
-        first_tree = _stored_first_pass(derivation)
-        if first_tree is None:
-            first_tree = first_pass(
-                capture, requested, dictionary=dictionary, progress=progress
+        name = f"{take}-{seal_of(derivation.provenance)[:16]}"
+        scratch = db.scratch() / name
+        _remove_first_passes(db, take, besides=name)
+        try:
+            first_tree = _stored_first_pass(scratch, take)
+            if first_tree is None:
+                first_tree = first_pass(
+                    capture, requested, dictionary=dictionary, progress=progress
+                )
+                _store_first_pass(scratch, take, first_tree)
+            elif progress is not None:
+                progress("first pass of the run before", 1, 1)
+            model = second_pass(
+                capture, first_tree, dictionary=dictionary, progress=progress
             )
-            _store_first_pass(derivation, first_tree, lease)
-        elif progress is not None:
-            progress("first pass of the run before", 1, 1)
-        model = second_pass(
-            capture, first_tree, dictionary=dictionary, progress=progress
-        )
-        model = model_with_summary(model)
-        model.attrs |= {
-            "seeds": {"fit": model.attrs["parameters"]["seed"]},
-            "summary_parameters": summary_parameters(),
-        }
-        record = derivation.commit(model, lease)
-        db.forget(FIRST_PASS, take)
+            model = model_with_summary(model)
+            model.attrs |= {
+                "seeds": {"fit": model.attrs["parameters"]["seed"]},
+                "summary_parameters": summary_parameters(),
+            }
+            record = derivation.commit(model, lease)
+        except (OSError, InputError):
+            if db.withdrawal(subject_of(take)) is not None:
+                _remove_first_passes(db, take)
+            raise
+        _remove_first_passes(db, take)
         return record
 
 
@@ -121,14 +129,13 @@ def fit_derivation(
     )
 
 
-def _stored_first_pass(derivation: Derivation) -> xr.DataTree | None:
+def _stored_first_pass(scratch: Path, take: str) -> xr.DataTree | None:
     """The first pass of a killed fit that would give the same model, in memory."""
-    db = derivation.db
-    take = derivation.key
+    db = Database(scratch)
     try:
-        if replace(derivation, kind=FIRST_PASS).current() is None:
+        if not db.has("model", take):
             return None
-        stored = db.read(FIRST_PASS, take)
+        stored = db.read("model", take)
         groups = {name: ds.compute() for name, ds in groups_of(stored).items()}
     except InputError:  # damaged: it is repeated
         return None
@@ -137,12 +144,22 @@ def _stored_first_pass(derivation: Derivation) -> xr.DataTree | None:
     return first_pass_tree
 
 
-def _store_first_pass(
-    derivation: Derivation, first_tree: xr.DataTree, lease: Lease
-) -> None:
-    """Keep a first pass for the case that the fit is killed; it replaces that of another fit."""
-    derivation.db.forget(FIRST_PASS, derivation.key)
-    replace(derivation, kind=FIRST_PASS).commit(first_tree, lease)
+def _store_first_pass(scratch: Path, take: str, first_tree: xr.DataTree) -> None:
+    """Keep a first pass for the case that the fit is killed, in a database of its own,
+    whose name contains a digest of all that decides the model.
+    """
+    shutil.rmtree(scratch, ignore_errors=True)  # a damaged one
+    with Database(scratch).stage("model", take) as stage:
+        stage.write(groups_of(first_tree))
+        stage.commit(first_tree.attrs)
+
+
+def _remove_first_passes(db: Database, take: str, besides: str = "") -> None:
+    """Remove the first passes of a take, except for that of this name."""
+    for log in db.scratch().glob(f"{take}-*/log/model/{take}"):
+        folder = log.parents[2]
+        if folder.name != besides:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 @logged("fit")

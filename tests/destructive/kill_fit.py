@@ -233,7 +233,7 @@ def attempt(
     )
     # not before: threads of a client of a bucket must not be forked
     db = skindb.open(url)
-    first = db.has("first", take)
+    first = has_first_pass(db, take)
     before = known["before"]
     there = generations(db, kind, take)
     said = f"{variant}, killed in {marks[-1]}"
@@ -254,12 +254,12 @@ def attempt(
         if (
             [one for one in db.garbage() if not one.kept]
             or db.verify()
-            or db.has("first", take) != (first and not committed)
+            or has_first_pass(db, take) != (first and not committed)
         ):
             return BAD[
                 4
             ], f"{said}: clean left {db.garbage()}, or removed what it must not"
-    first = db.has("first", take)
+    first = has_first_pass(db, take)
     stages = []
     following = WORK[variant](db, stages.append, work)
     if first and "first pass" in stages:
@@ -273,12 +273,17 @@ def attempt(
     if (
         db.verify()
         or unlisted(db)
-        or db.has("first", take)
+        or has_first_pass(db, take)
         or [*db.scratch().glob("*")]
     ):
         return BAD[4], f"{said}: after the second run"
     outcome = GOOD[2] if marks[-1] == "done" else GOOD[len(there) - len(before)]
     return outcome, json.dumps({"stage": marks[-1], "continued": first})
+
+
+def has_first_pass(db: Database, take: str) -> bool:
+    """Whether a first pass of a fit of a take was committed to its scratch folder."""
+    return any(db.scratch().glob(f"{take}-*/log/model/{take}/*.json"))
 
 
 def generations(db: Database, kind: str, take: str) -> list[int]:
@@ -301,12 +306,12 @@ def unlisted(db: Database) -> set[str]:
     }
     named = {
         db.record(kind, take, n).path
-        for kind in (*db.kinds(), "first")
+        for kind in db.kinds()
         for take in db.takes(kind)
         for n in generations(db, kind, take)
     }
     listed = {one.key for one in db.garbage()}
-    return {path for path in there - named - listed if "/first/" not in path}
+    return there - named - listed
 
 
 def killed_within(

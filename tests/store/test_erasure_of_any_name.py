@@ -58,7 +58,7 @@ class Planted:
         """Whether it is of one subject, and therefore outlives a product of others that
         it was made from.
         """
-        return self.record.kind in ("capture", "model", "first", "consent")
+        return self.record.kind in ("capture", "model", "consent")
 
 
 class Planter:
@@ -98,7 +98,7 @@ class Planter:
         has_subject = kind not in ("population", "release", "calibration")
         takes = set(named).union({take} if has_subject else set())
         # the others take over what their inputs refer to
-        if kind not in ("capture", "model", "first", "consent"):
+        if kind not in ("capture", "model", "consent"):
             takes = takes.union(*(one.takes for one in inputs))
         about: dict[str, Any] = {
             "consent_scope": ["fit", "statistics"],

@@ -207,40 +207,6 @@ def test_clean__ends_the_lease_of_a_killed_run(db, monkeypatch):
     assert db.garbage() == []
 
 
-ABOUT = {"requested": {"k": 2}, "dictionary_digest": "d", "code_digest": "m"}
-
-
-def test_clean__keeps_a_first_pass_until_its_model_is_there(db):
-    capture = db.record("capture", "A1").as_input()
-    commit(db.root, kind="first", inputs=[capture], **ABOUT)
-    key = "log/first/A1/00000001.json"
-    assert list(_kept(db)) == [key]
-    assert "so that the same run can resume" in _kept(db)[key]
-    commit(db.root, kind="model", inputs=[capture], **ABOUT | {"requested": {"k": 3}})
-    assert db.clean() == []
-    _age(db.root / "data/first", 25 * 3600)
-    assert _kept(db)[key] == ""
-    _age(db.root / "data/first", 0)
-    commit(db.root, kind="model", inputs=[capture], **ABOUT)
-    assert [one.what for one in db.clean()] == [
-        "the first pass of a fit that was committed"
-    ]
-    assert list(db.root.rglob("first/*")) == []
-    assert db.verify() == db.garbage() == []
-
-
-def test_clean__removes_what_is_left_of_a_first_pass(db):
-    path = _left(db, "first")
-    (db.root / "log/first/A1").mkdir(parents=True)
-    (db.root / "log/first/A1/00000001.json").write_text("damaged")
-    _age(db.root / "data/first", OLD)
-    assert db.verify() == []
-    assert [one.kept for one in db.garbage()] == [""]
-    db.clean()
-    assert not (db.root / path).exists()
-    assert not (db.root / "log/first/A1").exists()
-
-
 def test_clean__drops_old_generations_that_nothing_names(db):
     """Captures 1 to 5; model 1 is from capture 2, model 2 from capture 4; a release
     names capture 3; consents stay.

@@ -113,11 +113,6 @@ def _capture_under_lease(db: Database) -> None:
         _commit(db.url, "capture", SUBJECT, lease=lease)
 
 
-def _first_pass(db: Database) -> None:
-    db.forget("first", SUBJECT)
-    _commit(db.url, "first", SUBJECT)
-
-
 def _study(db: Database) -> None:
     models = [db.record("model", take) for take in (SUBJECT, "B")]
     _commit(
@@ -133,7 +128,6 @@ def _study_that_names(db: Database) -> None:
 WRITERS = {
     "capture": _capture,
     "capture under a lease": _capture_under_lease,
-    "first pass": _first_pass,
     "study": _study,
     "study that only names the subject": _study_that_names,
     "release": lambda db: db.create_release("r1"),

@@ -13,6 +13,7 @@ from planted_cohort import PARAMETERS, PEOPLE, capture, few_materials
 
 import skindb
 from skindb.errors import InputError
+from skindb.store import lease as lease_module
 from skindb.workflow import fit as fit_module
 from skindb.workflow.derive import groups_of
 from skindb.workflow.fit import fit_take
@@ -131,7 +132,7 @@ def test_fit_take__uses_no_first_pass_that_would_be_another(
 
 @pytest.mark.slow
 def test_fit_take__repeats_a_first_pass_that_is_damaged(killed):
-    for file in (killed.root / "data/first").rglob("c/*"):
+    for file in killed.root.glob("tmp/*/data/**/c/*"):
         if file.is_file():
             file.write_bytes(b"damaged")
     _, stages = _fit(killed)
@@ -144,14 +145,40 @@ def test_first_pass__is_no_result_and_leaves_nothing(killed):
     assert killed.info()["takes"].keys() == {TAKE}
     assert killed.info()["takes"][TAKE].keys() == {"capture"}
     assert killed.verify() == []
-    assert not (killed.root / "heads/first").exists()
+    [scratch] = killed.scratch().iterdir()
+    [garbage] = killed.garbage()
+    assert garbage.key == f"tmp/{scratch.name}"
+    assert "so that the same run can resume" in garbage.kept
     _fit(killed)
-    assert [
-        path for path in killed.root.rglob("*") if path.parent.name == "first"
-    ] == []
-    assert not (killed.root / "tombstones").exists()
-    with pytest.raises(ValueError, match="model of S01 must be removed by `remove`"):
-        killed.forget("model", TAKE)
+    assert [*killed.scratch().iterdir()] == []
+    assert killed.garbage() == []
+
+
+def test_first_pass__of_another_fit_is_removed(killed):
+    _fit(killed, replace(PARAMETERS, eta=1.31))
+    assert [*killed.scratch().iterdir()] == []
+
+
+def test_first_pass__is_removed_with_its_subject(killed):
+    killed.erase(TAKE)
+    assert [*killed.scratch().iterdir()] == []
+
+
+def test_first_pass__of_a_subject_who_is_withdrawn_meanwhile_is_removed(
+    db, monkeypatch
+):
+    store = fit_module._store_first_pass
+
+    def withdrawn(*arguments):
+        monkeypatch.setattr(lease_module, "_has_ended", lambda *_: True)
+        db.erase(TAKE)
+        store(*arguments)
+
+    monkeypatch.setattr(fit_module, "_store_first_pass", withdrawn)
+    with pytest.raises(InputError):
+        _fit(db)
+    assert [*db.scratch().iterdir()] == []
+    assert db.verify() == []
 
 
 def test_fit_take__refuses_while_another_run_works_on_the_take(db):
