@@ -168,7 +168,7 @@ class Bucket:
             return self._pending[path]
         if end is not None and end <= begin:
             return b""
-        options: dict[str, Any] = {}
+        options: Any = {}
         if end is not None:
             options = {"range": (begin, end)}
         elif begin:

@@ -350,7 +350,7 @@ def _has_data_for(record: Record, request: CohortRequest) -> bool:
             and "tables" in record.contents
         )
     if request.layout == "surfels":
-        count = contents["sizes"]["surfel"]
+        count = int(contents["sizes"]["surfel"])
         parameters = record.provenance.get("summary_parameters", {})
         # fewer than requested: the sample contains all fitted surfels
         is_complete = count < int(parameters.get("surfels", 0))

@@ -246,7 +246,7 @@ class Stage:
         self.committed = True
         return record
 
-    def _write_metadata(self, attrs: Mapping[str, Any]) -> None:
+    def _write_metadata(self, attrs: dict[str, Any]) -> None:
         """Write the metadata of the root and of each group with those of all nodes below
         it, so that a reader opens it by one file.
         """

@@ -151,7 +151,7 @@ def _store_first_pass(scratch: Path, take: str, first_tree: xr.DataTree) -> None
     shutil.rmtree(scratch, ignore_errors=True)  # a damaged one
     with Database(scratch).stage("model", take) as stage:
         stage.write(groups_of(first_tree))
-        stage.commit(first_tree.attrs)
+        stage.commit({str(name): value for name, value in first_tree.attrs.items()})
 
 
 def _remove_first_passes(db: Database, take: str, besides: str = "") -> None:
