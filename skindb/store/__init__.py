@@ -22,7 +22,7 @@ from skindb.store.place import (
     require_text,
     subject_of,
 )
-from skindb.store.record import Record, seal_of
+from skindb.store.record import Record, intact_or_none, seal_of
 from skindb.store.restoring import Restored, restore
 from skindb.store.snapshot import Lookup
 from skindb.store.stale import (
@@ -61,6 +61,7 @@ __all__ = [
     "WithdrawnError",
     "backup_states",
     "frame_of",
+    "intact_or_none",
     "lacking",
     "require_fresh",
     "require_text",

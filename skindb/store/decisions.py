@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from skindb.errors import Fault, InputError, input_error, require
+from skindb.errors import Fault, InputError, few_names, input_error, require
 from skindb.schema.consent import CONSENT, SCOPES, consent_scope
 from skindb.store.markers import note_consents
 from skindb.store.place import RELEASE, TAKE, Place, require_text, subject_of
@@ -97,8 +97,7 @@ def require_subject(place: Place, subject: str) -> None:
     subjects = Snapshot(place).subjects()
     if subject in subjects:
         return
-    finding = f"subjects: {', '.join(subjects[:MAX_NAMED]) or 'none'}"
-    finding += ", ..." if len(subjects) > MAX_NAMED else ""
+    finding = f"subjects: {few_names(subjects, MAX_NAMED) or 'none'}"
     cure = "see skindb info"
     if subject_of(subject) in subjects:
         cure = f"the subject of that take is {subject_of(subject)}"

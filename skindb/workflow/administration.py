@@ -10,12 +10,13 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import skindb
 from skindb import __version__, store
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, few_names
 from skindb.files import write_private
 from skindb.store import (
     CALIBRATION,
@@ -29,7 +30,7 @@ from skindb.store import (
     Request,
     Restored,
     State,
-    UnavailableError,
+    intact_or_none,
     seal_of,
     stale_versions,
 )
@@ -178,26 +179,17 @@ def superseded_calibrations(db: Database) -> dict[str, list[str]]:
     """
     newest = dict[str, int]()
     for name in db.takes(CALIBRATION):
-        try:
-            newest[name] = db.record(CALIBRATION, name).generation
-        except UnavailableError:
-            raise
-        except InputError:
-            continue
+        record = intact_or_none(partial(db.record, CALIBRATION, name))
+        if record is not None:
+            newest[name] = record.generation
     superseded = dict[str, list[str]]()
     for take in db.takes("capture") if max(newest.values(), default=1) > 1 else ():
-        try:
-            calibration = (
-                db.record("capture", take).provenance.get("calibrated_by") or {}
-            )
-        except UnavailableError:
-            raise
-        except InputError:
-            continue
-        if calibration.get("generation", 0) < newest.get(
-            str(calibration.get("take")), 0
+        record = intact_or_none(partial(db.record, "capture", take))
+        calibration = {} if record is None else record.provenance.get("calibrated_by")
+        if calibration and calibration["generation"] < newest.get(
+            calibration["take"], 0
         ):
-            superseded.setdefault(str(calibration["take"]), []).append(take)
+            superseded.setdefault(calibration["take"], []).append(take)
     return {name: sorted(takes) for name, takes in sorted(superseded.items())}
 
 
@@ -208,12 +200,9 @@ def superseded_lines(superseded: Mapping[str, Sequence[str]]) -> list[str]:
     lines = []
     for name, takes in superseded.items():
         count = "1 take was" if len(takes) == 1 else f"{len(takes)} takes were"
-        named = (
-            f"{', '.join(takes[:MAX_NAMED])}{', ...' if len(takes) > MAX_NAMED else ''}"
-        )
         lines.append(
             f"{count} ingested with an earlier version of calibration {name}: "
-            f"{named}; run skindb ingest again"
+            f"{few_names(takes, MAX_NAMED)}; run skindb ingest again"
         )
     return lines
 

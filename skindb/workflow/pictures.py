@@ -20,7 +20,7 @@ from skindb.render.photographs import Comparison, compare_photographs
 from skindb.render.rendering import chosen_camera, render, render_picture
 from skindb.render.scene import Camera, Environment, Lights
 from skindb.schema import variables
-from skindb.store import Database, UnavailableError, require_fresh
+from skindb.store import Database, intact_or_none, require_fresh
 from skindb.types import Progress, float64, silent
 from skindb.view.face import Trait, face_record, page_omissions, still_picture
 from skindb.view.landmarks import landmark_server, landmark_task
@@ -440,13 +440,8 @@ def _permitted(
     """The face of a take; None, and the face is removed, if its subject does not
     consent to exports any more.
     """
-    try:
-        scope = db.consent(take)
-    except UnavailableError:
-        raise
-    except InputError:  # the subject was withdrawn
-        scope = []
-    if "export" not in scope:
+    scope = intact_or_none(partial(db.consent, take))  # None: the subject was withdrawn
+    if scope is None or "export" not in scope:
         faces.pop(take, None)
     return faces.get(take)
 

@@ -8,8 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from skindb.errors import Fault, InputError, input_error
-from skindb.files import make_private, private_file, read_regular
+from skindb.errors import input_error
+from skindb.files import make_private, private_file
+from skindb.format.fields import read_json
 from skindb.parameters import SimulationParameters
 from skindb.types import Progress
 from skindb.virtual.capture import simulate_takes
@@ -17,7 +18,6 @@ from skindb.virtual.person import Person, cohort_people
 from skindb.workflow.takes import map_takes, results_of
 
 COHORT = "cohort.json"  # what the captures of a folder were made with
-MOST_BYTES = 1 << 20
 
 
 def simulate(
@@ -95,7 +95,8 @@ def begin_cohort(
     options = asdict(parameters) | {"conditions": list(conditions)}
     note = out / COHORT
     if note.is_file():
-        stored = _stored_options(note)
+        read = read_json(note, [])
+        stored = read if isinstance(read, dict) else {}
         differ = [
             f"{name} {stored.get(name)}"
             for name in sorted({*stored, *options})
@@ -119,18 +120,6 @@ def begin_cohort(
         make_private(out)
         private_file(note).write_text(json.dumps(options, indent=1), encoding="utf-8")
     return cohort_people(subjects, conditions=conditions, seed=parameters.seed)
-
-
-def _stored_options(note: Path) -> dict[str, Any]:
-    """The options that were noted when a cohort was begun."""
-    try:
-        stored = json.loads(read_regular(note, MOST_BYTES))
-    except (ValueError, RecursionError) as error:
-        fault = Fault(
-            str(note), "must be a JSON object", str(error), "choose another folder"
-        )
-        raise InputError(fault) from None
-    return stored if isinstance(stored, dict) else {}
 
 
 def simulate_one(
