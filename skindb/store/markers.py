@@ -21,25 +21,24 @@ record, and `skindb clean` removes it.
 
 The *marker file* is a local file outside the database that notes withdrawals and
 consents. A restore of an earlier backup repeats what the file notes.
-Each line is a JSON object with a seal that is keyed by the secret of the database.
-Subjects are named by keyed hashes only. Lines are only added; what is missing, for
-example after a full disk, is added by the next command that writes to the file.
+It is a JSON object with a seal that is keyed by the secret of the database. Subjects are
+named by keyed hashes only. Notes are only added, except for the consents of a subject
+who was withdrawn or has a newer one; what is missing, for example after a full disk, is
+added by the next command that writes the file.
 """
 
 from __future__ import annotations
 
-import errno
 import fcntl
 import hashlib
 import hmac
 import json
 import os
 import re
-import stat
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -52,13 +51,12 @@ from skindb.errors import (
     input_error,
     system_fault,
 )
-from skindb.files import PRIVATE_FILE, make_private, read_regular
+from skindb.files import make_private, read_regular, write_private
 from skindb.limits import MAX_STORE_JSON_BYTES
-from skindb.schema.consent import SCOPES, consent_scope
+from skindb.schema.consent import consent_scope
 from skindb.store.folder import flush_path
 from skindb.store.place import AUDIT, Place, UnavailableError
 from skindb.store.record import (
-    DIGEST,
     Record,
     collect_faults,
     damage_as_fault,
@@ -82,8 +80,8 @@ LOCKS = {
     RESTORING: ("a restore that is not complete", "run skindb restore again"),
     BACKUP: ("a backup", "run skindb restore, which makes a database of it"),
 }
-MARKER_FILE_FORMAT = 1
-MARKER_FILE_LINE = "line"  # the key in the seals of lines
+MARKER_FILE_FORMAT = 2
+MARKER_FILE = "markers"  # the key in its seal
 CURE_MARKER_FILE = (
     "give the right file; or rename this one, and the next withdrawal, consent or "
     "backup writes a new one"
@@ -260,7 +258,7 @@ class Notes:
     # hash of a subject -> its newest consent
     consents: dict[str, dict[str, Any]] = field(default_factory=dict)
     # keyed hashes of the seals of records of consent
-    records: set[str] = field(default_factory=set)
+    records: list[str] = field(default_factory=list)
 
 
 def read_marker_file(path: Path, secret: bytes) -> Notes:
@@ -268,28 +266,14 @@ def read_marker_file(path: Path, secret: bytes) -> Notes:
     database with this secret.
     """
     content = read_regular(path, MAX_STORE_JSON_BYTES)
-    return _notes_from(content, str(path), secret)
-
-
-def _notes_from(content: bytes, location: str, secret: bytes) -> Notes:
-    notes = Notes()
-    for number, line in enumerate(content.removesuffix(b"\n").split(b"\n"), 1):
-        try:
-            body = json_object(line)
-            if not is_sealed(secret, MARKER_FILE_LINE, body):
-                raise ValueError("a line that is damaged, or of another database")
-            if number == 1 and body.get("format") != MARKER_FILE_FORMAT:
-                raise ValueError("a first line of another format")
-            _add_line(notes, body)
-        except (ValueError, TypeError, KeyError, RecursionError) as error:
-            fault = Fault(
-                f"{location}, line {number}",
-                "a marker file must be as it was written",
-                str(error),
-                CURE_MARKER_FILE,
-            )
-            raise InputError(fault) from None
-    return notes
+    rule = "a marker file must be as it was written"
+    with damage_as_fault(str(path), rule, CURE_MARKER_FILE):
+        body = json_object(content)
+        if not is_sealed(secret, MARKER_FILE, body):
+            raise ValueError("content that is damaged, or of another database")
+        if body["format"] != MARKER_FILE_FORMAT:
+            raise ValueError("another format")
+        return Notes(body["entries"], body["consents"], body["records"])
 
 
 def note_withdrawals(place: Place, *, is_repeated: bool = False) -> None:
@@ -304,15 +288,16 @@ def note_withdrawals(place: Place, *, is_repeated: bool = False) -> None:
         Whether the caller calls this again later, so that a failure causes no warning.
     """
 
-    def lines(notes: Notes, _: bytes) -> list[dict[str, Any]]:
-        keys = [
-            f"{WITHDRAWN}/{name}"
-            for name in sorted(place.sizes(WITHDRAWN))
-            if ENTRY.fullmatch(name)
-        ]
-        return [_entry_line(place, key) for key in keys if key not in notes.entries]
+    def add(notes: Notes, _: bytes) -> None:
+        for name in place.sizes(WITHDRAWN):
+            key = f"{WITHDRAWN}/{name}"
+            match = ENTRY.fullmatch(name)
+            if match and key not in notes.entries:
+                notes.entries[key] = json_object(place.read_small(key))
+                # what was agreed to before the withdrawal
+                notes.consents.pop(match[1], None)
 
-    _add_lines(place, lines, is_repeated=is_repeated)
+    _note(place, add, is_repeated=is_repeated)
 
 
 def note_consents(place: Place, records: Iterable[Record]) -> None:
@@ -320,73 +305,42 @@ def note_consents(place: Place, records: Iterable[Record]) -> None:
     it is missing.
     """
 
-    def lines(notes: Notes, secret: bytes) -> list[dict[str, Any]]:
-        return [
-            line
-            for record in records
-            if (line := _consent_line(record, secret))["record"] not in notes.records
-        ]
+    def add(notes: Notes, secret: bytes) -> None:
+        for record in records:
+            name = keyed_hash(secret, record.seal)
+            if name not in notes.records:
+                notes.records.append(name)
+                notes.consents[keyed_hash(secret, record.take)] = {
+                    "consent": list(consent_scope(record.provenance)),
+                    "created": record.created,
+                    "record": name,
+                }
 
-    _add_lines(place, lines, is_repeated=False)
-
-
-def _add_line(notes: Notes, body: Mapping[str, Any]) -> None:
-    if "entry" in body:
-        name = str(body["entry"]).removeprefix(f"{WITHDRAWN}/")
-        match = ENTRY.fullmatch(name)
-        if match is None:
-            raise ValueError("a withdrawal with an invalid name")
-        notes.entries[f"{WITHDRAWN}/{name}"] = dict(body["content"])
-        notes.consents.pop(match[1], None)  # what was agreed to before the withdrawal
-    elif "consent" in body:
-        if not re.fullmatch(DIGEST, body["subject"]) or not set(body["consent"]) <= {
-            *SCOPES
-        }:
-            raise ValueError("a consent with invalid values")
-        notes.consents[body["subject"]] = dict(body)
-        notes.records.add(body["record"])
+    _note(place, add)
 
 
-def _entry_line(place: Place, key: str) -> dict[str, Any]:
-    return {"entry": key, "content": json_object(place.read_small(key))}
-
-
-def _consent_line(record: Record, secret: bytes) -> dict[str, Any]:
-    return {
-        "consent": list(consent_scope(record.provenance)),
-        "subject": keyed_hash(secret, record.take),
-        "created": record.created,
-        "record": keyed_hash(secret, record.seal),
-    }
-
-
-def _add_lines(
+def _note(
     place: Place,
-    missing: Callable[[Notes, bytes], list[dict[str, Any]]],
+    add: Callable[[Notes, bytes], None],
     *,
-    is_repeated: bool,
+    is_repeated: bool = False,
 ) -> None:
-    """Add the lines that are missing; a file that cannot be written is a warning,
-    because the database is not.
+    """Add notes to a marker file; a file that cannot be written is a warning, because
+    the database is not.
     """
     path = place.marker_file()
     try:
         secret = require_secret(place)
-        with _locked(path) as number:
-            content = os.pread(number, MAX_STORE_JSON_BYTES, 0)
-            # without a line whose writer was killed
-            complete = content[: content.rfind(b"\n") + 1]
-            notes = _notes_from(complete, str(path), secret) if complete else Notes()
-            bodies = ([] if complete else [{"format": MARKER_FILE_FORMAT}]) + missing(
-                notes, secret
-            )
-            lines = [
-                json.dumps({**body, "seal": keyed_seal(secret, MARKER_FILE_LINE, body)})
-                for body in bodies
-            ]
-            _append(
-                number, len(complete), "".join(f"{line}\n" for line in lines).encode()
-            )
+        with _locked(path.parent):
+            # a link to another disk stays
+            file = path.resolve()
+            notes = read_marker_file(path, secret) if file.exists() else Notes()
+            before = seal_of(asdict(notes))
+            add(notes, secret)
+            if seal_of(asdict(notes)) != before or not file.exists():
+                body = {"format": MARKER_FILE_FORMAT, **asdict(notes)}
+                seal = keyed_seal(secret, MARKER_FILE, body)
+                _write(file, json.dumps({**body, "seal": seal}).encode())
     except UnavailableError:
         raise
     except (OSError, InputError) as error:
@@ -405,25 +359,14 @@ def _add_lines(
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[int]:
-    """Descriptor of a marker file, which is created if it is missing, and which no
-    other process writes.
-    """
-    make_private(path.parent)
-    is_new = not path.exists()
-    number = os.open(
-        path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK, PRIVATE_FILE
-    )
+def _locked(folder: Path) -> Iterator[None]:
+    """Context in which no other process writes a marker file in a folder."""
+    make_private(folder)
+    number = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
     try:
-        if not stat.S_ISREG(os.fstat(number).st_mode):
-            raise OSError(
-                errno.EINVAL, "something that is not a regular file", str(path)
-            )
         fcntl.flock(number, fcntl.LOCK_EX)
         try:
-            yield number
-            if is_new:
-                flush_path(path.resolve().parent)
+            yield
         finally:
             # closing alone keeps it while a copy of the descriptor is open
             fcntl.flock(number, fcntl.LOCK_UN)
@@ -431,15 +374,10 @@ def _locked(path: Path) -> Iterator[int]:
         os.close(number)
 
 
-def _append(number: int, size: int, content: bytes) -> None:
-    """Write durably at the end of a file of this size, everything or nothing."""
-    os.ftruncate(number, size)
-    if not content:
-        return
-    try:
-        if os.pwrite(number, content, size) < len(content):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        os.fsync(number)
-    except OSError:
-        os.ftruncate(number, size)
-        raise
+def _write(file: Path, content: bytes) -> None:
+    """Write or replace a file durably, everything or nothing."""
+    temporary = file.with_name(f".{file.name}.tmp")
+    write_private(temporary, content)
+    flush_path(temporary)
+    temporary.replace(file)
+    flush_path(file.parent)

@@ -311,30 +311,24 @@ def test_restore__needs_a_marker_file(db, dest, tmp_path):
     assert Database(target).takes("model") == ["B", SUBJECT]
 
 
-@pytest.mark.parametrize(
-    "damage", ["line changed", "line removed", "line cut", "other database", "empty"]
-)
+@pytest.mark.parametrize("damage", ["changed", "cut", "other database", "empty"])
 def test_restore__refuses_a_damaged_marker_file(db, dest, tmp_path, damage):
     db.backup(str(dest))
     db.erase(SUBJECT)
     file = db.place.marker_file()
-    lines = file.read_bytes().splitlines(keepends=True)
+    content = file.read_bytes()
     if damage == "other database":
         other = Database(tmp_path / "other")
         _commit(other.url, "capture", "A")
         other.backup(str(tmp_path / "other backup"))
-        lines = other.place.marker_file().read_bytes().splitlines(keepends=True)
-    elif damage == "line changed":
-        lines[1] = lines[1].replace(b'"removed"', b'"Removed"')
-    elif damage == "line removed":
-        lines = lines[1:]
-    elif damage == "line cut":
-        lines[1] = lines[1][:40]
+        content = other.place.marker_file().read_bytes()
+    elif damage == "changed":
+        content = content.replace(b'"removed"', b'"Removed"')
     else:
-        lines = []
-    file.write_bytes(b"".join(lines))
+        content = content[: len(content) // 2 if damage == "cut" else 0]
+    file.write_bytes(content)
     with pytest.raises(
-        InputError, match=r"line [12]: a marker file must be as it was written; found"
+        InputError, match="a marker file must be as it was written; found"
     ) as error:
         _restored(db, dest, tmp_path / "copy")
     assert len(str(error.value).splitlines()) == 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
@@ -19,7 +20,6 @@ from skindb.store import Database, MarkerFileWarning, markers
 from skindb.store.folder import Folder
 from skindb.store.markers import (
     mark_withdrawn,
-    note_withdrawals,
     read_marker_file,
     read_markers,
     read_withdrawal,
@@ -176,7 +176,7 @@ def test_marker_file__notes_withdrawals_and_consents(db):
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     size = file.stat().st_size
     db.complete_erasures()
-    assert file.stat().st_size == size  # each line once
+    assert file.stat().st_size == size  # each note once
 
 
 def test_marker_file__can_be_a_link_to_another_disk(db, tmp_path):
@@ -196,13 +196,20 @@ def test_marker_file__that_was_lost_is_written_again(db):
     assert _notes(db) == before
 
 
-def test_marker_file__continues_after_a_line_that_was_cut_off(db):
-    db.erase(SUBJECT)
+def test_marker_file__of_a_killed_writer_is_the_one_before(db, monkeypatch):
+    db.record_consent("B", ["fit"])
     before = db.place.marker_file().read_bytes()
-    for size in range(1, len(before), 7):
-        db.place.marker_file().write_bytes(before[:size])
-        note_withdrawals(db.place)
-        assert db.place.marker_file().read_bytes() == before
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(markers, "flush_path", killed)
+        with pytest.raises(KeyboardInterrupt):
+            db.erase(SUBJECT)
+    assert db.place.marker_file().read_bytes() == before
+    db.complete_erasures()
+    assert len(_notes(db).entries) == 1
 
 
 def test_marker_file__that_cannot_be_written_is_a_warning(db, tmp_path, monkeypatch):
@@ -216,13 +223,15 @@ def test_marker_file__that_cannot_be_written_is_a_warning(db, tmp_path, monkeypa
     assert db.consent("B") == ["fit"]
     db.place.marker_file().rmdir()
     os.mkfifo(db.place.marker_file())
-    with pytest.warns(
-        MarkerFileWarning, match="found something that is not a regular file"
-    ):
+    with pytest.warns(MarkerFileWarning, match="found a named pipe"):
         db.erase(SUBJECT)
     assert db.takes() == ["B"]
     db.place.marker_file().unlink()
-    monkeypatch.setattr(os, "pwrite", lambda *_: 0)
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(markers, "write_private", full)
     with pytest.warns(
         MarkerFileWarning, match="found No space left on device; free some space there"
     ):
@@ -237,11 +246,17 @@ def test_marker_file__is_unlocked_although_a_copy_of_its_descriptor_is_open(
 ):
     """Such as that of a process that was forked meanwhile."""
     copies = []
-    monkeypatch.setattr(os, "fsync", lambda number: copies.append(os.dup(number)))
+    flock = fcntl.flock
+
+    def copied(number, operation):
+        copies.append(os.dup(number))
+        flock(number, operation)
+
+    monkeypatch.setattr(fcntl, "flock", copied)
     db.erase(SUBJECT)
-    with db.place.marker_file().open("rb") as file:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    for number in copies:
+    folder = os.open(db.place.marker_file().parent, os.O_RDONLY)
+    flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    for number in (*copies, folder):
         os.close(number)
 
 
@@ -253,20 +268,19 @@ def test_marker_file__of_another_database_is_kept(db, tmp_path):
     shutil.copy(other.place.marker_file(), db.place.marker_file())
     with pytest.warns(
         MarkerFileWarning,
-        match=r"found a line that is damaged, or of another database; give the right",
+        match=r"found content that is damaged, or of another database; give the right",
     ):
         db.erase(SUBJECT)
     assert db.place.marker_file().read_bytes() == content
 
 
-def test_marker_file__of_many_writers_has_each_line_once(db):
+def test_marker_file__of_many_writers_has_every_note(db):
     subjects = [f"S{number}" for number in range(8)]
     for subject in subjects:
         commit(db.root, take=subject, n=2)
     with ThreadPoolExecutor(8) as threads:
         list(threads.map(partial(_consent, db.url), subjects))
     assert len(_notes(db).consents) == 8
-    assert len(db.place.marker_file().read_bytes().splitlines()) == 9
 
 
 def _consent(url, subject):
