@@ -173,7 +173,7 @@ def block_content(key: str, entries: Iterable[Entry]) -> bytes:
         return shared.setdefault(json.dumps(value), len(shared))
 
     rows = []
-    for entry in entries:
+    for entry in sorted(entries, key=lambda entry: entry.record.key):
         record = entry.record
         provenance = record.provenance
         own = {n: value for n, value in provenance.items() if n not in SHARED_PARTS}
