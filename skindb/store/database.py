@@ -173,8 +173,6 @@ class Database:
         kind: str,
         take: str,
         generation: int | None = None,
-        *,
-        markers: Markers | None = None,
     ) -> Record:
         """The record of a version, by default the current one.
 
@@ -182,8 +180,6 @@ class Database:
         ----------
         kind, take, generation
             Kind, take and generation of the version.
-        markers
-            Result of `markers`, to read many records with one list of the withdrawals.
 
         Raises
         ------
@@ -191,7 +187,7 @@ class Database:
             If the version does not exist, if its record is damaged, or if it refers to
             a withdrawn subject.
         """
-        return Snapshot(self.place, markers).record(kind, take, generation)
+        return Snapshot(self.place).record(kind, take, generation)
 
     def markers(self) -> Markers:
         """The withdrawals of subjects at this moment."""

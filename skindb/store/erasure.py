@@ -53,7 +53,6 @@ FOLDERS_WITH_TAKES = ("log", "data", "heads", "leases")
 # results before their inputs, and all others last
 REMOVAL_ORDER = ("edit", STUDY, RELEASE, SUMMARY, "registration")
 REGISTRATION = "registration"
-SUBJECT = r"[A-Za-z0-9_-]{1,64}"
 # name of the scratch folder of an ingest, and of the first pass of a fit
 SCRATCH_NAME = re.compile(rf"({TAKE})-[0-9a-f]{{16}}")
 # end of the name of a scratch folder whose removal was interrupted
@@ -284,16 +283,6 @@ def subject_holdings(place: Place, subject: str) -> Holdings:
     InputError
         If the database holds nothing of the subject.
     """
-    rule = "the database must hold the subject"
-    if not re.fullmatch(SUBJECT, subject):
-        cure = (
-            f"give the subject, {subject_of(subject)}"
-            if re.fullmatch(TAKE, subject)
-            else "see skindb info"
-        )
-        raise input_error(
-            repr(subject)[:200], rule, "a name that is not that of a subject", cure
-        )
     markers = read_markers(place)
     holdings = holdings_of(place, markers.with_withdrawn(subject))
     if markers.is_withdrawn(subject):
@@ -301,7 +290,7 @@ def subject_holdings(place: Place, subject: str) -> Holdings:
             return holdings
         raise input_error(
             subject,
-            rule,
+            "the database must hold the subject",
             "that the subject was withdrawn, and nothing is left",
             "see skindb info",
         )

@@ -243,17 +243,9 @@ class VerifiedStore(ListedStore):
         """Raise an `InputError` with all missing and truncated files, before values are read."""
         sizes = self.place.sizes(self.record.path)
         faults: list[Fault] = []
-        for key, (size, _) in self.files.items():
-            if key not in sizes:
-                faults += self._fault(key, "no file").faults
-            elif sizes[key] < 0:
-                faults += self._fault(
-                    key, "something that is not a regular file"
-                ).faults
-            elif sizes[key] != size:
-                faults += self._fault(
-                    key, f"{sizes[key]} bytes instead of {size}"
-                ).faults
+        for key, file in self.files.items():
+            if finding := size_difference(sizes.get(key), file):
+                faults += self._fault(key, finding).faults
         if faults:
             raise InputError(faults)
 
@@ -264,6 +256,17 @@ class VerifiedStore(ListedStore):
             finding,
             CURE,
         )
+
+
+def size_difference(size: int | None, file: Committed) -> str:
+    """How a file of this size, see `Place.sizes`, differs from what was committed; empty
+    if it does not.
+    """
+    if size is None:
+        return "no file"
+    if size < 0:
+        return "something that is not a regular file"
+    return "" if size == file.size else f"{size} bytes instead of {file.size}"
 
 
 def limits(byte_range: Any) -> tuple[int, int | None]:

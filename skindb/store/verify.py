@@ -40,6 +40,7 @@ from skindb.store.verified import (
     VerifiedStore,
     read_beside,
     read_manifest,
+    size_difference,
 )
 
 # patterns of the names in a database, by level; versions are folders, everything else files
@@ -274,21 +275,14 @@ def _file_fault(
 ) -> Fault | None:
     key = f"{record.path}/{name}"
     location = place.where(key)
-    if name not in sizes:
-        return Fault(location, AS_COMMITTED, "no file", CURE)
     if name not in manifest:
         return Fault(location, AS_COMMITTED, "an unknown file or folder", "remove it")
-    if sizes[name] < 0:
-        return Fault(
-            location, AS_COMMITTED, "something that is not a regular file", CURE
-        )
-    finding = _difference(place, key, sizes[name], manifest[name])
+    file = manifest[name]
+    finding = size_difference(sizes.get(name), file) or _difference(place, key, file)
     return Fault(location, AS_COMMITTED, finding, CURE) if finding else None
 
 
-def _difference(place: Place, key: str, size: int, file: Committed) -> str:
-    if size != file.size:
-        return f"{size} bytes instead of {file.size}"
+def _difference(place: Place, key: str, file: Committed) -> str:
     try:
         return "" if place.digests(key) == file.digests else CHANGED
     except OSError as error:  # reported, so that other damage is still found

@@ -214,9 +214,9 @@ def _models(db: Database, cohort: xr.Dataset) -> list[Record]:
     """Records of the models of a cohort."""
     takes = cohort["take"].values
     generations = cohort["model_generation"].values
-    markers = db.markers()
+    lookup = Lookup(db)
     return [
-        db.record("model", str(take), int(generation), markers=markers)
+        lookup.generation("model", str(take), int(generation))
         for take, generation in zip(takes, generations, strict=True)
     ]
 
