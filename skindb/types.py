@@ -1,7 +1,7 @@
 """Types that many modules share, and arrays of vectors."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,24 +20,29 @@ Faces = NDArray[np.integer[Any]]  # (f, 3) vertices of triangles
 
 # Arrays of compiled kernels by rank and dtype; docstrings name the lengths, such as
 # "rows (n, m)". Float64 unless the name ends with the bits.
-Vector = np.ndarray[tuple[int], np.dtype[np.float64]]
-Matrix = np.ndarray[tuple[int, int], np.dtype[np.float64]]
-Cube = np.ndarray[tuple[int, int, int], np.dtype[np.float64]]
-Tensor = np.ndarray[tuple[int, int, int, int], np.dtype[np.float64]]  # four axes
-Vector32 = np.ndarray[tuple[int], np.dtype[np.float32]]
-Matrix32 = np.ndarray[tuple[int, int], np.dtype[np.float32]]
-Cube32 = np.ndarray[tuple[int, int, int], np.dtype[np.float32]]
-Tensor32 = np.ndarray[tuple[int, int, int, int], np.dtype[np.float32]]
-IntVector = np.ndarray[tuple[int], np.dtype[np.int64]]
-IntMatrix = np.ndarray[tuple[int, int], np.dtype[np.int64]]
-IntCube = np.ndarray[tuple[int, int, int], np.dtype[np.int64]]
-IntVector32 = np.ndarray[tuple[int], np.dtype[np.int32]]
-IntMatrix32 = np.ndarray[tuple[int, int], np.dtype[np.int32]]
-BoolVector = np.ndarray[tuple[int], np.dtype[np.bool_]]
-BoolMatrix = np.ndarray[tuple[int, int], np.dtype[np.bool_]]
-BoolCube = np.ndarray[tuple[int, int, int], np.dtype[np.bool_]]
-ByteVector = np.ndarray[tuple[int], np.dtype[np.uint8]]
-ByteMatrix = np.ndarray[tuple[int, int], np.dtype[np.uint8]]
+Scalar = TypeVar("Scalar", bound=np.generic)
+Rank1 = np.ndarray[tuple[int], np.dtype[Scalar]]
+Rank2 = np.ndarray[tuple[int, int], np.dtype[Scalar]]
+Rank3 = np.ndarray[tuple[int, int, int], np.dtype[Scalar]]
+Rank4 = np.ndarray[tuple[int, int, int, int], np.dtype[Scalar]]
+Vector = Rank1[np.float64]
+Matrix = Rank2[np.float64]
+Cube = Rank3[np.float64]
+Tensor = Rank4[np.float64]  # four axes
+Vector32 = Rank1[np.float32]
+Matrix32 = Rank2[np.float32]
+Cube32 = Rank3[np.float32]
+Tensor32 = Rank4[np.float32]
+IntVector = Rank1[np.int64]
+IntMatrix = Rank2[np.int64]
+IntCube = Rank3[np.int64]
+IntVector32 = Rank1[np.int32]
+IntMatrix32 = Rank2[np.int32]
+BoolVector = Rank1[np.bool_]
+BoolMatrix = Rank2[np.bool_]
+BoolCube = Rank3[np.bool_]
+ByteVector = Rank1[np.uint8]
+ByteMatrix = Rank2[np.uint8]
 
 Real = float | np.floating[Any]
 Integer = int | np.integer[Any]
