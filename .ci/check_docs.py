@@ -7,6 +7,7 @@ Links between pages of the site are checked by Sphinx (`make docs`). This progra
 
 * that pages, changelog, notebooks, help texts, and the comments, docstrings and
   messages of the code and of the tests use common technical terms (`TERMS`);
+* that no line of a page begins with a percent sign, which would make it a comment;
 * that every `skindb` command in a block marked bash, console or sh exists and accepts
   its options and arguments, and that scripts, tests and make targets in such blocks
   exist;
@@ -131,6 +132,14 @@ def source_faults(where: str, source: str) -> Iterator[str]:
                 yield f"{where}:{line}: {' '.join(match.group().split())!r}; write: {term}"
 
 
+def comment_faults(where: str, text: str) -> Iterator[str]:
+    """Lines that begin with a percent sign: MyST reads them as comments and drops them."""
+    lines = CODE.sub(blank, text)
+    for match in re.finditer(r"^ *%.*", lines, re.M):
+        line = lines.count("\n", 0, match.start()) + 1
+        yield f"{where}:{line}: {match.group()[:40]!r} is a comment; wrap the line elsewhere"
+
+
 def help_texts() -> Iterator[tuple[str, str]]:
     """Help texts of all commands and options, not wrapped."""
     for name, command in {"": cli, **cli.commands}.items():
@@ -250,7 +259,7 @@ def main() -> int:
     for page in pages():
         where = page.relative_to(ROOT).as_posix()
         text = page.read_text(encoding="utf-8")
-        faults += term_faults(where, text)
+        faults += [*term_faults(where, text), *comment_faults(where, text)]
         for line, words in commands(text):
             calls += 1
             said = command_fault(words) if words else ""

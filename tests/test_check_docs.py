@@ -36,6 +36,13 @@ def test_term_faults__names_the_line():
     assert fault.startswith("page:5: 'left out'")
 
 
+def test_comment_faults__names_lines_that_begin_with_a_percent_sign():
+    (fault,) = check_docs.comment_faults(
+        "page", "```text\n% x\n```\n\nIt is met within 8\n% of the truth.\n"
+    )
+    assert fault.startswith("page:6: '% of the truth.'")
+
+
 @pytest.mark.parametrize(
     ("source", "found"),
     [
