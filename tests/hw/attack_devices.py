@@ -106,7 +106,7 @@ NAMED_FAULTS = {
     "vanish": "closed its line",
     "frozen": "no progress",
     "silent": "no reply|reading of the gauge",
-    "deaf": "no reply",
+    "deaf": "no reply|reading of the gauge",
     "slow": "no reply|reading of the gauge|within",
 }
 NAMES = {
