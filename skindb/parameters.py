@@ -109,9 +109,9 @@ def permutations_option(default: int = 10_000) -> Any:
     return option(default, text, minimum=100, maximum=MAX_PERMUTATIONS)
 
 
-def seed_option(purpose: str) -> Any:
+def seed_option(purpose: str, default: int = 0) -> Any:
     """Field of a record for the random seed."""
-    return option(0, f"Random seed for {purpose}.", minimum=0, maximum=MAX_SEED)
+    return option(default, f"Random seed for {purpose}.", minimum=0, maximum=MAX_SEED)
 
 
 @dataclass(frozen=True)
@@ -266,12 +266,7 @@ class FitParameters(Limited):
     hold_out_cameras: float = option(
         0.0, "Fraction of cameras held out.", minimum=0, maximum=0.9
     )
-    seed: int = option(
-        0,
-        "Random seed for the hold-out and for sampling.",
-        minimum=0,
-        maximum=MAX_SEED,
-    )
+    seed: int = seed_option("the hold-out and for sampling")
 
     def __post_init__(self) -> None:
         """Check the limits, and that mixtures alone have `k` and `rank`."""
@@ -506,7 +501,7 @@ class SimulationParameters(Limited):
         False,
         "Circular polarisers, crossed in every other camera and parallel in the rest.",
     )
-    seed: int = option(VIRTUAL_SEED, "Noise seed.", minimum=0, maximum=MAX_SEED)
+    seed: int = seed_option("noise", VIRTUAL_SEED)
 
     def __post_init__(self) -> None:
         """Check the limits of each size and of their products."""
@@ -636,7 +631,7 @@ class RenderParameters(Limited):
         minimum=1e-4,
         maximum=1,
     )
-    seed: int = option(0, "Random seed.", minimum=0, maximum=MAX_SEED)
+    seed: int = seed_option("the directions of rays")
     scale: float = option(
         1.0,
         "Size of the picture relative to that of the camera.",
@@ -729,12 +724,7 @@ class DemoParameters(Limited):
     lights: int = option(
         48, "Number of lights of the virtual dome.", minimum=12, maximum=MAX_LIGHTS
     )
-    seed: int = option(
-        VIRTUAL_SEED,
-        "Random seed for noise and sampling.",
-        minimum=0,
-        maximum=MAX_SEED,
-    )
+    seed: int = seed_option("noise and sampling", VIRTUAL_SEED)
     workers: int | None = option(
         None,
         "Number of takes at a time.  [default: one for each core, at most 4]",

@@ -1,7 +1,6 @@
 """Edits of a model along trait vectors (Weyrich et al. 2005, section 11)."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ import xarray as xr
 from skindb.analysis.albedo import cumulative, decorrelate, histogram, quantiles
 from skindb.analysis.brdf import project
 from skindb.analysis.subjects import trait_name
-from skindb.analysis.texture import at_surfels, edit_texture
+from skindb.analysis.texture import TextureEdit, at_surfels, edit_texture
 from skindb.errors import Fault, InputError, input_error
 from skindb.numerics.texture import quantile_levels, valid_quantiles
 from skindb.optics.diffusion import dipole_s
@@ -46,8 +45,6 @@ def apply_traits(
     texture: xr.Dataset | None = None,
     maps: xr.Dataset | None = None,
     registered: xr.Dataset | None = None,
-    parts: tuple[str, ...] = ("brdf", "albedo", "translucency"),
-    rng: np.random.Generator | None = None,
 ) -> xr.DataTree:
     """Edited copy of a model, moved along trait vectors.
 
@@ -66,10 +63,6 @@ def apply_traits(
         From `texture_statistics` of the takes, `common_maps` of the model at the same
         size, and `register`. If they are given, the albedo changes at every scale,
         region by region (see `edit_texture`); otherwise only its colours do.
-    parts
-        Parts of the model that are edited.
-    rng
-        Random generator of the noise that adds texture to skin without any; by default with seed 0.
 
     Returns
     -------
@@ -100,10 +93,11 @@ def apply_traits(
           B), clipped (fraction of the area limited to physical values; for the surface,
           the fraction of the requested vector that was omitted), distance (of the
           edited mean from that of the population, in standard deviations over takes; a
-          text if it is unknown). For the albedo also how: "texture", with trace (RMS
-          difference from the target quantiles before each iteration and after the last,
-          for every axis) and distance_before, or "colours", with projected (mean change
-          by making quantiles monotone, in standard deviations of colour). For the
+          text if it is unknown), from_nearest (its part of `edit_distance`). For the
+          albedo also how: "texture", with trace (RMS difference from the target
+          quantiles before each iteration and after the last, for every axis) and
+          distance_before, or "colours", with projected (mean change by making quantiles
+          monotone, in standard deviations of colour). For the
           translucency also unknown (traits whose shift was not measured, so that it is
           not applied).
     """
@@ -114,49 +108,52 @@ def apply_traits(
     fitted = model["fitted"].to_dataset().load()
     tree = model.copy()
     reports: dict[str, Report] = {}
-    moves = []
-    if "brdf" in parts:
-        shift = amount @ traits[variables.TRAIT_BRDF_SHIFT].values
-        metric = brdf_metric(tables)
-        fitted, reports["brdf"], move = _moved_surface(fitted, shift, basis, metric)
-        tree["basis"] = xr.DataTree(_common_basis(model, basis, tables))
-        moves.append(move)
-    if "albedo" in parts:
-        mapped = None
-        if texture is not None and maps is not None and registered is not None:
-            mapped = _MappedSkin(texture, maps, registered[variables.COMMON_UV].values)
-        fitted, reports["albedo"], move = _moved_skin(
-            fitted, amount, traits, albedo, mapped, rng
+    shift = amount @ traits[variables.TRAIT_BRDF_SHIFT].values
+    fitted, reports["brdf"] = _moved_surface(fitted, shift, basis, brdf_metric(tables))
+    mixture = basis[variables.POPULATION_MIXTURE].values
+    names = basis["dictionary"].values.tolist()
+    tree["basis"] = xr.DataTree(_common_basis(model, mixture, names, tables))
+    if (
+        texture is None
+        or maps is None
+        or registered is None
+        or TEXTURE_SHIFT not in traits
+    ):
+        shift = np.tensordot(amount, traits[variables.TRAIT_QUANTILE_SHIFT].values, 1)
+        fitted, reports["albedo"] = _moved_albedo(fitted, shift, albedo)
+    else:
+        is_used = amount != 0
+        shifts = traits[TEXTURE_SHIFT].values[is_used].astype(float)
+        shift = np.tensordot(amount[is_used], shifts, 1)
+        edit = edit_texture(maps, shift, texture, rng=np.random.default_rng(0))
+        uv = registered[variables.COMMON_UV].values
+        fitted, reports["albedo"] = _moved_texture(
+            fitted, shift, edit, uv, texture, albedo
         )
-        moves.append(move)
-    if "translucency" in parts and variables.SIGMA_TR in fitted:
-        fitted, reports["translucency"], move = _moved_sigma_tr(fitted, amount, traits)
-        moves.append(move)
+    if variables.SIGMA_TR in fitted:
+        fitted, reports["translucency"] = _moved_sigma_tr(fitted, amount, traits)
         tree = _with_moved_sites(tree, amount, traits)
     tree["fitted"] = xr.DataTree(surviving(fitted))
-    names = [str(traits["trait"].values[i]) for i in np.flatnonzero(amount)]
     tree.attrs = take_attrs(model.attrs) | {
         "edit": dict(amounts),
-        "edit_distance": max(moves, default=0.0),
+        "edit_distance": max(report["from_nearest"] for report in reports.values()),
         "edit_report": reports,
-        "trait_notes": _notes(traits, names),
+        "trait_notes": _notes(traits, amount),
     }
     return tree
 
 
-def _notes(traits: xr.Dataset, names: list[str]) -> list[str]:
+def _notes(traits: xr.Dataset, amount: Array) -> list[str]:
     """A line for each trait: its number of takes, or the warning of the study about it."""
     flagged = {flag.partition(": ")[0]: flag for flag in traits.attrs.get("flags", [])}
-    counts = {
-        str(t): traits[variables.TRAIT_COUNT].sel(trait=t).values.tolist()
-        for t in traits["trait"].values
-    }
-    # for a numeric attribute, all takes are counted on one side
-    sides = {
-        t: f"{n} takes with, {without} without" if without else f"{n} takes"
-        for t, (n, without) in counts.items()
-    }
-    return [flagged.get(name, f"{name}: {sides[name]}") for name in names]
+    notes = []
+    for i in np.flatnonzero(amount):
+        name = str(traits["trait"].values[i])
+        count, without = traits[variables.TRAIT_COUNT].values[i].tolist()
+        # for a numeric attribute, all takes are counted on one side
+        sides = f" with, {without} without" if without else ""
+        notes.append(flagged.get(name, f"{name}: {count} takes{sides}"))
+    return notes
 
 
 def _trait_amounts(amounts: Mapping[str, float], traits: xr.Dataset) -> Array:
@@ -173,17 +170,10 @@ def _trait_amounts(amounts: Mapping[str, float], traits: xr.Dataset) -> Array:
             faults += error.faults
     if faults:
         raise InputError(faults)
-    if not np.isfinite(total).all():
+    if not (np.abs(total) <= MAX_AMOUNT).all():
         raise input_error(
             "amount",
-            "must be a finite number",
-            str(dict(amounts)),
-            "give a number such as 0.5",
-        )
-    if np.abs(total).max(initial=0.0) > MAX_AMOUNT:
-        raise input_error(
-            "amount",
-            f"must be between -{MAX_AMOUNT:g} and {MAX_AMOUNT:g}; 1 is the whole difference",
+            f"must be a number from -{MAX_AMOUNT:g} to {MAX_AMOUNT:g}; 1 is the whole difference",
             str(dict(amounts)),
             "give a number such as 0.5",
         )
@@ -192,34 +182,46 @@ def _trait_amounts(amounts: Mapping[str, float], traits: xr.Dataset) -> Array:
 
 def _moved_surface(
     fitted: xr.Dataset, shift: Array, basis: xr.Dataset, metric: Array
-) -> tuple[xr.Dataset, Report, float]:
+) -> tuple[xr.Dataset, Report]:
     """Refit the surface to the basis of the population, and move its mean coefficients
     (component,) by the shift.
     """
-    weights = fitted[variables.DICTIONARY_WEIGHT].values.astype(float)
-    good = finite_rows(weights)
-    area = fitted[variables.SURFEL_AREA].values[good].astype(float)
     H = basis[variables.POPULATION_MIXTURE].values.astype(float)
-    here = project(weights[good], H, metric)
-    moved = np.full((len(weights), len(H)), np.nan)
-    mean = np.average(here, axis=0, weights=area)
+    here = _projected(fitted, H, metric)
+    mean = _mean(fitted, here)
     [target] = project(((mean + shift) @ H)[None], H, metric) if shift.any() else [mean]
     step = target - mean
     weaker = np.where(
         (step < 0) & (mean > 0), target / np.where(mean > 0, mean, 1.0), 1.0
     )
-    moved[good] = here * weaker + np.maximum(step, 0.0)
-    takes = basis["take"].values.tolist()
+    moved = here * weaker + np.maximum(step, 0.0)
     gram = H @ metric @ H.T
-    distance, move = _distances(
-        target, mean, basis[variables.TAKE_COEFFICIENT].values, takes, gram
-    )
-    report = _report(shift, step, np.zeros(len(area), bool), area, distance)
-    report["clipped"] = float(_length(step - shift, gram)) / max(
-        float(_length(shift, gram)), 1e-300
-    )
-    rest = fitted.drop_dims("component")  # the components of another basis differ
-    return rest.assign(basis_weight=label(variables.BASIS_WEIGHT, moved)), report, move
+    report = _report(shift, step, basis[variables.TAKE_COEFFICIENT], target, mean, gram)
+    whole = max(float(_length(shift, gram)), 1e-300)
+    report["clipped"] = float(_length(step - shift, gram)) / whole
+    return _with_weights(fitted, moved), report
+
+
+def _projected(fitted: xr.Dataset, H: Array, metric: Array) -> Array:
+    """Weights (n, k) of the surfels in a basis H (k, m); NaN without a fit."""
+    weights = fitted[variables.DICTIONARY_WEIGHT].values.astype(float)
+    good = finite_rows(weights)
+    projected = np.full((len(weights), len(H)), np.nan)
+    projected[good] = project(weights[good], H, metric)
+    return projected
+
+
+def _with_weights(fitted: xr.Dataset, weights: Array) -> xr.Dataset:
+    """The surface with weights in another basis, which has other components."""
+    rest = fitted.drop_dims("component")
+    return rest.assign(basis_weight=label(variables.BASIS_WEIGHT, weights))
+
+
+def _mean(fitted: xr.Dataset, values: Array) -> Array:
+    """Area-weighted mean (...) of values (n, ...) over the surfels that have any."""
+    good = finite_rows(values)
+    area = fitted[variables.SURFEL_AREA].values[good].astype(float)
+    return np.asarray(np.average(values[good], axis=0, weights=area))
 
 
 def with_basis(
@@ -242,102 +244,57 @@ def with_basis(
     """
     fitted = model["fitted"].to_dataset().load()
     tree = model.copy()
-    weights = fitted[variables.DICTIONARY_WEIGHT].values.astype(float)
-    good = finite_rows(weights)
-    coefficients = np.full((len(weights), len(mixture)), np.nan)
-    coefficients[good] = project(weights[good], float64(mixture), brdf_metric(tables))
-    rest = fitted.drop_dims("component")  # the components of another basis differ
-    fitted = rest.assign(basis_weight=label(variables.BASIS_WEIGHT, coefficients))
-    basis = xr.Dataset(
-        {variables.POPULATION_MIXTURE: (("component", "dictionary"), mixture)},
-        {"dictionary": list(names)},
-    )
-    tree["basis"] = xr.DataTree(_common_basis(model, basis, tables))
-    tree["fitted"] = xr.DataTree(surviving(fitted))
+    weights = _projected(fitted, float64(mixture), brdf_metric(tables))
+    tree["basis"] = xr.DataTree(_common_basis(model, mixture, names, tables))
+    tree["fitted"] = xr.DataTree(surviving(_with_weights(fitted, weights)))
     tree.attrs = take_attrs(model.attrs)
     return tree
 
 
-def _common_basis(model: xr.DataTree, basis: xr.Dataset, tables: Array) -> xr.Dataset:
-    H = basis[variables.POPULATION_MIXTURE].values
-    brdf = stored_brdf(tables @ H.T.astype(np.float32))
-    disc = model["basis/disc_angular_radius"].values
+def _common_basis(
+    model: xr.DataTree, mixture: Array, names: Sequence[str], tables: Array
+) -> xr.Dataset:
+    brdf = stored_brdf(tables @ mixture.T.astype(np.float32))
     source = model["basis"].attrs.get("dictionary")
     return dataset(
         {
-            variables.BASIS_MIXTURE: H,
+            variables.BASIS_MIXTURE: mixture,
             variables.BASIS_BRDF: brdf,
-            variables.DISC_ANGULAR_RADIUS: disc,
+            variables.DISC_ANGULAR_RADIUS: model["basis/disc_angular_radius"].values,
         },
-        coords={
-            "dictionary": basis["dictionary"].values,
-            **brdf_coords(TableGrid(*tables.shape[:3])),
-        },
+        coords={"dictionary": names, **brdf_coords(TableGrid(*tables.shape[:3]))},
         attrs={} if source is None else {"dictionary": source},
     )
-
-
-@dataclass(frozen=True)
-class _MappedSkin:
-    """Albedo map of a registered take, and the distributions of its population."""
-
-    texture: xr.Dataset  # from `texture_statistics`
-    maps: xr.Dataset
-    uv: Array  # (surfel, 2) common texture coordinates
-
-
-def _moved_skin(
-    fitted: xr.Dataset,
-    amount: Array,
-    traits: xr.Dataset,
-    albedo: xr.Dataset,
-    mapped: _MappedSkin | None,
-    rng: np.random.Generator | None,
-) -> tuple[xr.Dataset, Report, float]:
-    """Move the albedo: with a map at every scale, otherwise only its colours."""
-    if mapped is None or TEXTURE_SHIFT not in traits:
-        shift = np.tensordot(amount, traits[variables.TRAIT_QUANTILE_SHIFT].values, 1)
-        return _moved_albedo(fitted, shift, albedo)
-    is_used = amount != 0
-    shifts = traits[TEXTURE_SHIFT].values[is_used].astype(float)
-    shift = np.tensordot(amount[is_used], shifts, 1)
-    rng = np.random.default_rng(0) if rng is None else rng
-    return _moved_texture(fitted, shift, mapped, albedo, rng)
 
 
 def _moved_texture(
     fitted: xr.Dataset,
     shift: Array,
-    mapped: _MappedSkin,
+    edit: TextureEdit,
+    uv: Array,
+    texture: xr.Dataset,
     albedo: xr.Dataset,
-    rng: np.random.Generator,
-) -> tuple[xr.Dataset, Report, float]:
-    """Shift the distributions of log albedo and of its bands in the map, and apply the
-    change to the surfels.
+) -> tuple[xr.Dataset, Report]:
+    """Apply a change of the map, by shifts of the distributions of log albedo and of its
+    bands, to the surfels at common texture coordinates (n, 2).
     """
-    texture = mapped.texture
-    edit = edit_texture(mapped.maps, shift, texture, rng=rng)
     colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(float)
-    target = colour * np.exp(at_surfels(edit.change, mapped.uv))
-    fitted, report, move = _with_albedo(fitted, target, albedo)
-    report["distance"] = ONE_SUBJECT if edit.distance is None else edit.distance
-    report |= {
-        "how": "texture",
-        "trace": [list(row) for row in edit.trace],
-        "distance_before": edit.distance_before,
-    }
+    target = colour * np.exp(at_surfels(edit.change, uv))
+    moved, report = _with_albedo(fitted, target, albedo)
     # requested change of the mean of the whole face, like the other values of the report
     region = texture["region"].values.tolist().index(FACE)
     step = (
         np.nan_to_num(shift[region, :, 0]).mean(axis=-1)
         @ np.linalg.inv(texture[variables.TEXTURE_COLOUR_AXIS].values).T
     )
-    good = finite_rows(colour)
-    mean = np.average(
-        colour[good], axis=0, weights=fitted[variables.SURFEL_AREA].values[good]
-    )
-    report["requested"] = [float(v) for v in mean * np.expm1(step)]
-    return fitted, report, move
+    report |= {
+        "how": "texture",
+        "requested": (_mean(fitted, colour) * np.expm1(step)).tolist(),
+        "trace": [list(row) for row in edit.trace],
+        "distance": ONE_SUBJECT if edit.distance is None else edit.distance,
+        "distance_before": edit.distance_before,
+    }
+    return moved, report
 
 
 def with_albedo(fitted: xr.Dataset, albedo: Array) -> xr.Dataset:
@@ -353,33 +310,33 @@ def with_albedo(fitted: xr.Dataset, albedo: Array) -> xr.Dataset:
 
 def _with_albedo(
     fitted: xr.Dataset, target: Array, albedo: xr.Dataset
-) -> tuple[xr.Dataset, Report, float]:
-    """The fitted surface with new albedos (n, 3), the report of the change, and its distance."""
+) -> tuple[xr.Dataset, Report]:
+    """The fitted surface with new albedos (n, 3), and the report of the change."""
     moved = with_albedo(fitted, target)
     colour, out = (
         version[variables.DIFFUSE_REFLECTANCE].values.astype(float)
         for version in (fitted, moved)
     )
-    good = finite_rows(colour)
-    area = fitted[variables.SURFEL_AREA].values[good].astype(float)
-    before, now = (np.average(x[good], axis=0, weights=area) for x in (colour, out))
-    face = albedo["region"].values.tolist().index(FACE)
-    takes = albedo[variables.ALBEDO_MEAN].values[:, face]
+    before = _mean(fitted, colour)
+    now = _mean(fitted, out)
+    takes = albedo[variables.ALBEDO_MEAN].sel(region=FACE)
     axes = albedo[variables.COLOUR_AXIS].values
     # on the decorrelated axes, the unit is the standard deviation of skin in that direction
-    distance, move = _distances(
-        now, before, takes, albedo["take"].values.tolist(), axes.T @ axes
-    )
-    cut = (np.clip(target, DARKEST, BRIGHTEST) != target)[good] & (target != colour)[
-        good
-    ]
-    report = _report(now - before, now - before, cut.any(axis=1), area, distance)
-    return moved, report, move
+    report = _report(now - before, now - before, takes, now, before, axes.T @ axes)
+    cut = (np.clip(target, DARKEST, BRIGHTEST) != target) & (target != colour)
+    report["clipped"] = _fraction(fitted, cut, colour)
+    return moved, report
+
+
+def _fraction(fitted: xr.Dataset, cut: Mask, values: Array) -> float:
+    """Fraction of the area of the surfels with values (n, 3) in which any is cut."""
+    is_cut = np.where(finite_rows(values), cut.any(axis=1), np.nan)
+    return float(_mean(fitted, is_cut[:, None])[0])
 
 
 def _moved_albedo(
     fitted: xr.Dataset, shift: Array, albedo: xr.Dataset
-) -> tuple[xr.Dataset, Report, float]:
+) -> tuple[xr.Dataset, Report]:
     """Shift the quantiles of albedo by the shift of the whole face."""
     colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(float)
     good = finite_rows(colour)
@@ -408,45 +365,31 @@ def _moved_albedo(
     back = np.linalg.inv(axes).T
     edited = colour.copy()
     edited[good] = matched @ back + mean
-    fitted, report, move = _with_albedo(fitted, edited, albedo)
-    report["requested"] = [float(v) for v in shift[face].mean(axis=1) @ back]
-    report |= {"how": "colours", "projected": float(np.abs(target - shifted).mean())}
-    return fitted, report, move
+    moved, report = _with_albedo(fitted, edited, albedo)
+    report |= {
+        "how": "colours",
+        "requested": (shift[face].mean(axis=1) @ back).tolist(),
+        "projected": float(np.abs(target - shifted).mean()),
+    }
+    return moved, report
 
 
 def _moved_sigma_tr(
     fitted: xr.Dataset, amount: Array, traits: xr.Dataset
-) -> tuple[xr.Dataset, Report, float]:
+) -> tuple[xr.Dataset, Report]:
     """Scale sigma_tr; traits without a measured shift are not applied, and the report
     names them.
     """
     log, is_measured = _log_shift(amount, traits)
     before = np.log(fitted[variables.SIGMA_TR].values.astype(float))
     after = np.clip(before + log, *np.log(SIGMA_TR_RANGE))
-    good = finite_rows(before)
-    area = fitted[variables.SURFEL_AREA].values[good].astype(float)
-    mean, now = (np.average(x[good], axis=0, weights=area) for x in (before, after))
-    population = traits[variables.TAKE_LOG_SIGMA_TR]
-    measured = finite_rows(population.values)
-    names = [str(t) for t in population["take"].values[measured]]
-    distance, move = _distances(
-        now, mean, population.values[measured], names, np.eye(3)
-    )
-    report = _report(
-        np.exp(log),
-        np.exp(now - mean),
-        (after != before + log)[good].any(axis=1),
-        area,
-        distance,
-    )
-    report["unknown"] = [
-        str(t) for t in traits["trait"].values[~is_measured & (amount != 0)]
-    ]
-    return (
-        fitted.assign(sigma_tr=label(variables.SIGMA_TR, np.exp(after))),
-        report,
-        move,
-    )
+    mean, now = (_mean(fitted, logs) for logs in (before, after))
+    takes = traits[variables.TAKE_LOG_SIGMA_TR].dropna("take")
+    report = _report(np.exp(log), np.exp(now - mean), takes, now, mean, np.eye(3))
+    report["clipped"] = _fraction(fitted, after != before + log, before)
+    is_unknown = ~is_measured & (amount != 0)
+    report["unknown"] = [str(t) for t in traits["trait"].values[is_unknown]]
+    return fitted.assign(sigma_tr=label(variables.SIGMA_TR, np.exp(after))), report
 
 
 def surviving(ds: xr.Dataset) -> xr.Dataset:
@@ -459,25 +402,19 @@ def surviving(ds: xr.Dataset) -> xr.Dataset:
 def _with_moved_sites(
     tree: xr.DataTree, amount: Array, traits: xr.Dataset
 ) -> xr.DataTree:
-    """The model without the measurements of the probe, and with moved sites."""
+    """The model without the measurements of the probe, and with probe sites whose
+    sigma_tr is scaled like the map; errors are omitted, as they do not include those of
+    the vector.
+    """
     tree = tree.drop_nodes([name for name in (PROBED,) if name in tree.children])
     if "translucency" in tree.children:
         sites = tree["translucency"].to_dataset().load()
-        tree["translucency"] = xr.DataTree(_moved_sites(sites, amount, traits))
+        log, _ = _log_shift(amount, traits)
+        scaled = sites[variables.SITE_SIGMA_TR].values.astype(float) * np.exp(log)
+        moved = label(variables.SITE_SIGMA_TR, np.clip(scaled, *SIGMA_TR_RANGE))
+        kept = surviving(sites).drop_attrs(deep=False)
+        tree["translucency"] = xr.DataTree(kept.assign(site_sigma_tr=moved))
     return tree
-
-
-def _moved_sites(sites: xr.Dataset, amount: Array, traits: xr.Dataset) -> xr.Dataset:
-    """Probe sites with sigma_tr scaled like the map; errors are omitted, as they do not
-    include those of the vector.
-    """
-    log, _ = _log_shift(amount, traits)
-    moved = np.clip(
-        sites[variables.SITE_SIGMA_TR].values.astype(float) * np.exp(log),
-        *SIGMA_TR_RANGE,
-    )
-    moved_sites = surviving(sites).drop_attrs(deep=False)
-    return moved_sites.assign(site_sigma_tr=label(variables.SITE_SIGMA_TR, moved))
 
 
 def _log_shift(amount: Array, traits: xr.Dataset) -> tuple[Array, Mask]:
@@ -492,43 +429,41 @@ def _log_shift(amount: Array, traits: xr.Dataset) -> tuple[Array, Mask]:
 def _report(
     requested: Array,
     applied: Array,
-    cut: Mask,
-    area: Array,
-    distance: float | str,
+    takes: xr.DataArray,
+    now: Array,
+    before: Array,
+    metric: Array,
 ) -> Report:
-    return {
-        "requested": [float(v) for v in requested],
-        "applied": [float(v) for v in applied],
-        "clipped": float(np.average(cut, weights=area)),
-        "distance": distance,
-    }
-
-
-def _distances(
-    now: Array, before: Array, takes: Array, names: list[str], metric: Array
-) -> tuple[float | str, float]:
-    """Distances of a mean `now` (d,) from the mean of the takes (t, d), and from the
-    nearest take or the mean `before`.
+    """Report of the change of a mean (d,) from `before` to `now`, with its distances
+    from the mean of the takes (t, d), and from the nearest take or the mean before.
 
     The first is in standard deviations of the takes over all directions, or a text if
     these are unknown. The second is relative to the median distance between two takes,
     and infinite if that is 0.
     """
-    i, j = np.triu_indices(len(takes), 1)
-    typical = float(np.median(_length(takes[i] - takes[j], metric))) if len(i) else 0.0
-    near = float(_length(now - np.vstack([takes, before]), metric).min())
-    far = near / typical if typical > 0 else float("inf") if near > 0 else 0.0
-    if len({name.partition(".")[0] for name in names}) < 2:
-        return ONE_SUBJECT if names else NO_SUBJECT, far
-    mean = takes.mean(axis=0)
-    spread = float(
-        np.sqrt((_length(takes - mean, metric) ** 2).sum() / (len(takes) - 1))
+    values = takes.values
+    i, j = np.triu_indices(len(values), 1)
+    typical = (
+        float(np.median(_length(values[i] - values[j], metric))) if len(i) else 0.0
     )
-    return (
-        float(_length(now - mean, metric)) / spread
-        if spread > 0
-        else "unknown: all takes are alike"
-    ), far
+    near = float(_length(now - np.vstack([values, before]), metric).min())
+    beyond = float("inf") if near > 0 else 0.0
+    distance: float | str = NO_SUBJECT
+    subjects = {str(take).partition(".")[0] for take in takes["take"].values}
+    if len(subjects) == 1:
+        distance = ONE_SUBJECT
+    elif subjects:
+        mean = values.mean(axis=0)
+        square = (_length(values - mean, metric) ** 2).sum() / (len(values) - 1)
+        distance = "unknown: all takes are alike"
+        if square > 0:
+            distance = float(_length(now - mean, metric) / np.sqrt(square))
+    return {
+        "requested": requested.tolist(),
+        "applied": applied.tolist(),
+        "distance": distance,
+        "from_nearest": near / typical if typical > 0 else beyond,
+    }
 
 
 def describe_edit(report: Mapping[str, Report]) -> list[str]:

@@ -20,6 +20,7 @@ from skindb.cli.options import (
 )
 from skindb.cli.shared import aligned, cluster, emit, existing, trait_amounts, writable
 from skindb.cli.terminal import bar
+from skindb.errors import few_names
 from skindb.parameters import EditParameters
 
 if TYPE_CHECKING:
@@ -141,37 +142,32 @@ def _report_grid(grid: Path, drawn: dict[str, xr.DataTree]) -> None:
     notes = [
         f"{label}: {line}"
         for label, tree in drawn.items()
-        for line in [*_edit_notes(tree), *_extrapolation(tree)]
+        for line in [*_edit_notes(tree), _distance(tree)]
     ]
     emit({"path": str(grid), "edits": reports}, [str(grid), *notes])
 
 
-def _extrapolation(tree: xr.DataTree) -> list[str]:
-    """A warning if an edit is far from the data."""
+def _distance(tree: xr.DataTree) -> str:
+    """How far an edit is from the data, with a warning if that is far."""
     distance = float(tree.attrs["edit_distance"])
-    if distance <= MAX_EDIT_DISTANCE:
-        return []
-    return [
+    warning = f"; {EXTRAPOLATED}" if distance > MAX_EDIT_DISTANCE else ""
+    return (
         f"the distance to the nearest take is {distance:.2f} times the median distance "
-        f"between takes; {EXTRAPOLATED}"
-    ]
+        f"between takes{warning}"
+    )
 
 
 def _report_edit(record: Record, tree: xr.DataTree) -> None:
     """Print the report of an edit that was stored."""
-    distance = float(tree.attrs["edit_distance"])
-    warning = f"; {EXTRAPOLATED}" if distance > MAX_EDIT_DISTANCE else ""
     takes = tree.attrs["study_takes"]
     lines = [
-        f"{record.take}: edit {record.generation}; the distance to the nearest take is "
-        f"{distance:.2f} times the median distance between takes{warning}",
-        f"  traits from the study of {len(takes)} takes: "
-        f"{', '.join(takes[:8])}{', ...' if len(takes) > 8 else ''}",
+        f"{record.take}: edit {record.generation}; {_distance(tree)}",
+        f"  traits from the study of {len(takes)} takes: {few_names(takes)}",
     ]
     summary = {
         "generation": record.generation,
         "path": record.path,
-        "edit_distance": distance,
+        "edit_distance": float(tree.attrs["edit_distance"]),
         "edit_report": dict(tree.attrs["edit_report"]),
     }
     emit(summary, [*lines, *(f"  {line}" for line in _edit_notes(tree))])

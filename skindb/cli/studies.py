@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from skindb.store import Database
-    from skindb.types import Progress
 
 ANALYSIS = Path(skindb.__file__).parent / "analysis"
 TAKES = click.option(
@@ -209,11 +208,13 @@ def _run_study(
     release: str | None,
     name: str | None,
     csv: Path | None,
-    **drawn: Any,
+    plot: Path | None,
+    faces: Path | None = None,
+    site: str | None = None,
 ) -> None:
     """Compute or read a study, and print, write and draw it."""
-    pictures = StudyPictures(**drawn)
-    pictures.require_writable()
+    for picture in filter(None, (plot, faces)):
+        writable(picture, ".png", ".pdf", ".svg")
     if csv:
         writable(csv, ".csv")
     chosen = dict(vars(parameters))
@@ -226,7 +227,7 @@ def _run_study(
     progress = bar()
     progress(f"analyze {study.name}", 0, 1)
     studied = takes or database.takes("model", release=release)
-    arguments = {"faces": pictures.faces is not None}
+    arguments = {"faces": faces is not None}
     with skindb.workflow.logged_action(
         database, "study", studied, what=study.name, arguments=arguments
     ):
@@ -238,35 +239,13 @@ def _run_study(
                 database, study.name, takes=takes, release=release, name=name, **chosen
             )
         progress(f"analyze {study.name}", 1, 1)
-        pictures.draw(database, results, progress)
-    _report(database, study, results, csv)
-
-
-@dataclass(frozen=True)
-class StudyPictures:
-    """Pictures that a command draws of a study, if they are named."""
-
-    plot: Path | None
-    faces: Path | None = None  # of the most and the least translucent take
-    site: str | None = None  # of the faces
-
-    def require_writable(self) -> None:
-        """Check the names of the pictures before anything is computed."""
-        for picture in (self.plot, self.faces):
-            if picture:
-                writable(picture, ".png", ".pdf", ".svg")
-
-    def draw(
-        self, database: Database, results: xr.DataTree, progress: Progress
-    ) -> None:
-        """Draw the pictures."""
-        if self.faces:
-            site = self.site or "cheek"
+        if faces:
             skindb.workflow.translucency_grid(
-                database, self.faces, site=site, progress=progress
+                database, faces, site=site or "cheek", progress=progress
             )
-        if self.plot:
-            skindb.analysis.plot_study(results, self.plot)
+        if plot:
+            skindb.analysis.plot_study(results, plot)
+    _report(database, study, results, csv)
 
 
 def _report(

@@ -160,9 +160,9 @@ def test_apply_traits__moves_every_part():
     assert models["B"].attrs.get("edit") is None
     with pytest.raises(InputError, match="an unknown name; choose from: age:older"):
         apply_traits(models["B"], amounts={"lotoin": 1.0}, **call)
-    with pytest.raises(InputError, match="must be between -100 and 100"):
+    with pytest.raises(InputError, match="must be a number from -100 to 100"):
         apply_traits(models["B"], amounts={"lotion": 1e9}, **call)
-    with pytest.raises(InputError, match="finite number"):
+    with pytest.raises(InputError, match="must be a number from"):
         apply_traits(models["B"], amounts={"lotion": np.inf}, **call)
 
 
@@ -253,9 +253,6 @@ def test_apply_traits__drops_what_an_edit_makes_untrue():
         "trait_notes",
     }
     assert set(model.children) == {"fitted", "basis", "translucency", "probe"}
-    assert set(apply_traits(model, **call, parts=("albedo",)).children) == set(
-        model.children
-    )
 
 
 def test_apply_traits__mean_albedo_moves_by_the_mean_difference():
