@@ -147,7 +147,7 @@ def _linear_refit(fitted: xr.Dataset, basis: xr.Dataset) -> Callable[[], Any]:
     block = block_of(arrays, take_noise(fitted))
     comparison = Comparison("linear", 1.3, noise_floor(fitted), MIN_SAMPLES)
     surface = surface_model(basis)
-    return lambda: surface.judge(block, comparison, Judgement())
+    return lambda: surface.fit(block, comparison, Judgement())
 
 
 ACTIONS = {

@@ -251,7 +251,7 @@ def refit_curves(quick: bool) -> list[Curve]:
     surfels = len(samples.offsets) - 1
     comparison = Comparison("linear", ETA, NOISE_FLOOR_SURFACE, MIN_SAMPLES_GLOSS)
     errors = Judgement(np.full((surfels, 3), 0.01), np.full(surfels, 0.5))
-    judge = partial(four.judge, samples.block, comparison, errors)
+    judge = partial(four.fit, samples.block, comparison, errors)
     judge()  # compiles
     seconds, judged = cpu_time(judge, surfels)
     measured.append(("skindb with errors, linear", seconds, judged.parameters))

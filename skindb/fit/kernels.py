@@ -12,13 +12,13 @@ from skindb.elementwise import thread_count
 from skindb.fit.model import COMPILING
 from skindb.fit.normals import METHODS, surfel_normals
 from skindb.jit import is_stored
-from skindb.reflectance._block_kernels import fit_block, judge_block
-from skindb.reflectance._ggx_kernels import fit_ggx, judge_ggx
+from skindb.reflectance._block_kernels import fit_block
+from skindb.reflectance._ggx_kernels import fit_ggx
 from skindb.reflectance._joint_kernels import fit_jointly
 from skindb.reflectance.ggx import GGX
 from skindb.reflectance.joint import refine_block
 from skindb.reflectance.mixture import Mixture
-from skindb.reflectance.model import Block, Comparison, FitRequest, Judgement
+from skindb.reflectance.model import Block, Comparison, FitRequest
 from skindb.reflectance.separation import separate_diffuse
 from skindb.types import Progress, silent
 
@@ -29,7 +29,7 @@ def compile_kernels(progress: Progress = silent) -> None:
     """Compile the kernels that fits spend the most time to compile, where they are not
     stored yet; the others are compiled at their first use.
     """
-    kernels = (fit_jointly, fit_block, judge_block, fit_ggx, judge_ggx)
+    kernels = (fit_jointly, fit_block, fit_ggx)
     if all(is_stored(kernel) for kernel in kernels):
         return
     progress(COMPILING, 0, len(STEPS))
@@ -57,8 +57,6 @@ def compile_step(step: str) -> None:
     sample = np.zeros((0, 1, 1, 3), np.float16)
     block = Block(sample, none, one, one, none, none)
     comparison = Comparison()
-    held = np.zeros((1, 1), np.int64)
-    judgement = Judgement(none, np.zeros(0), held, outliers=True)
     match step:
         case "joint":
             refine_block(block, comparison, scan_normal=none, scan_error=1.0)
@@ -68,6 +66,5 @@ def compile_step(step: str) -> None:
             kind = Mixture if step == "mixture" else GGX
             model = kind.unfitted(FitRequest(1.3, 0.0, 16, 4))
             model.fit(block, comparison)
-            model.judge(block, comparison, judgement)
         case "normals":
             surfel_normals(*block[:4], none, method=METHODS[0], eta=1.3, scan_error=3.0)

@@ -29,9 +29,9 @@ from skindb.reflectance.kinds import surface_model
 from skindb.reflectance.model import (
     MIN_LOBE_WIDTH,
     Comparison,
-    JudgedFit,
     Judgement,
     ReflectanceModel,
+    SurfaceFit,
 )
 from skindb.schema import check, dataset, text_labels, variables
 from skindb.types import Array
@@ -309,9 +309,7 @@ def _judged(
             diffuse_error = np.zeros((part.sizes["surfel"], 3))
         judgement = Judgement(diffuse_error, arrays.get("normal_error"), held, outliers)
         parameters = surface.parameters_of(part) if evaluate else None
-        judged = surface.judge(
-            block_of(arrays, noise), comparison, judgement, parameters
-        )
+        judged = surface.fit(block_of(arrays, noise), comparison, judgement, parameters)
         fitted = {} if evaluate else surface.judged_columns(judged)
         return fitted | _error_columns(judged, judgement), judged.counts
 
@@ -327,7 +325,7 @@ def _judged(
     return _Judged(dataset(columns, coords=coords), counts)
 
 
-def _error_columns(judged: JudgedFit, judgement: Judgement) -> dict[str, Array]:
+def _error_columns(judged: SurfaceFit, judgement: Judgement) -> dict[str, Array]:
     """Variables of the surfels with the errors of their predictions."""
     columns = {
         "fit_residual": judged.residual,

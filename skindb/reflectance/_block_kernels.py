@@ -7,7 +7,6 @@ Rows are formed and solved surfel by surfel, so that those of one surfel, 60 kB 
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +14,6 @@ import numpy as np
 from skindb.jit import kernel
 from skindb.reflectance._lumitexel_kernels import (
     FITTED,
-    LAMBERT,
     OUTLIER_SPREAD,
     PERCEPTUAL,
     JudgedErrors,
@@ -29,8 +27,8 @@ from skindb.reflectance._lumitexel_kernels import (
     outliers,
     prepare,
     relative_drift,
-    smallest_half_angle,
     split_diffuse,
+    start_fit,
     weigh,
     weigh_outliers,
     write_rows,
@@ -45,7 +43,7 @@ from skindb.reflectance._mixture_kernels import (
     weight_covariance,
 )
 from skindb.reflectance._turn_kernels import add_turned, turn_memory
-from skindb.reflectance.model import Block, JudgedFit, SurfaceFit
+from skindb.reflectance.model import Block, SurfaceFit
 from skindb.types import Matrix, Tensor32, Vector
 
 KKT_TOLERANCE = 1e-10
@@ -60,29 +58,6 @@ class Tables(NamedTuple):
 
 
 @kernel
-def _problem(count: int, lift: Matrix, options: Options, b: Lumitexel) -> Problem:
-    return Problem(
-        b.rows,
-        b.target,
-        b.weight,
-        count,
-        lift,
-        options.mode == PERCEPTUAL,
-        options.floor,
-        KKT_TOLERANCE,
-    )
-
-
-@kernel
-def _fit_rows(
-    count: int, lift: Matrix, options: Options, x: Vector, b: Lumitexel, work: FitMemory
-) -> tuple[float, int, bool, float]:
-    """Fit the samples in `b`, from zero."""
-    x[:] = 0.0
-    return fit_one(_problem(count, lift, options, b), x, work)
-
-
-@kernel
 def _block_narrow(half_width: Vector, narrowest: float, work: FitMemory) -> None:
     """Block the columns that are narrower than an angle, except the widest."""
     limit = min(narrowest, half_width.max())
@@ -91,72 +66,44 @@ def _block_narrow(half_width: Vector, narrowest: float, work: FitMemory) -> None
 
 
 @kernel
-def fit_block(block: Block, tables: Tables, options: Options, out: SurfaceFit) -> None:
-    """Fit, or only evaluate, every surfel of a block by the dictionary."""
-    table = tables.table
-    lift = tables.lift
-    b = block_memory(block, table.shape[3])
-    work = fit_memory(b.pairs.shape[0], table.shape[3], lift.shape[1])
-    for s in range(block.position.shape[0]):
-        out.status[s] = prepare(s, block, options, b)
-        if out.status[s] != FITTED:
-            continue
-        count = write_rows(block.normal[s], table, b)
-        out.samples[s] = count
-        seen = smallest_half_angle(count, b)
-        out.half_angle[s] = math.degrees(seen)
-        split_diffuse(block.diffuse[s], count, b)
-        if count < options.min_samples:
-            matt = fitted_status(True, block.diffuse[s])
-            out.status[s] = LAMBERT if matt == FITTED else matt
-            b.surface[:] = 0.0
-            out.residual[s], out.residual_perceptual[s] = add_surface(count, b)
-            continue
-        weigh(s, count, block.noise, options, b)
-        x = out.parameters[s]
-        if options.solve:
-            _block_narrow(tables.half_width, options.min_width * seen, work)
-            out.kkt[s], out.iterations[s], converged, out.condition[s] = _fit_rows(
-                count, lift, options, x, b, work
-            )
-            if options.mode == PERCEPTUAL:
-                predict(b.rows, count, coefficients(lift, x), b.surface, work.single)
-                weigh_outliers(count, options, b, work.root)
-                out.kkt[s], more, converged, out.condition[s] = fit_one(
-                    _problem(count, lift, options, b), x, work
-                )
-                out.iterations[s] += more
-            out.status[s] = fitted_status(converged, block.diffuse[s])
-        predict(b.rows, count, coefficients(lift, x), b.surface, work.single)
-        out.residual[s], out.residual_perceptual[s] = add_surface(count, b)
+def _solve(
+    s: int, p: Problem, options: Options, b: Lumitexel, work: FitMemory, out: SurfaceFit
+) -> bool:
+    """Fit the weights of surfel s; returns whether they converged."""
+    x = out.parameters[s]
+    x[:] = 0.0
+    out.kkt[s], out.iterations[s], converged, out.condition[s] = fit_one(p, x, work)
+    if p.perceptual:
+        predict(p.rows, p.size, coefficients(p.lift, x), b.surface, work.single)
+        weigh_outliers(p.size, options, b, work.root)
+        out.kkt[s], more, converged, out.condition[s] = fit_one(p, x, work)
+        out.iterations[s] += more
+    return converged
 
 
 @kernel
 def _write_covariance(
     s: int,
-    count: int,
+    p: Problem,
     block: Block,
-    options: Options,
     errors: JudgedErrors,
-    out: JudgedFit,
+    out: SurfaceFit,
     b: Lumitexel,
     work: FitMemory,
 ) -> None:
     """Covariance of the weights of surfel s by noise and by the error of R_d."""
     drift = np.empty(3)
     relative_drift(block.diffuse[s], errors.diffuse[s], drift)
-    for r in range(count):
+    for r in range(p.size):
         work.root.total[r] = b.target[0, r] + b.target[1, r] + b.target[2, r]
+    spread = OUTLIER_SPREAD if p.perceptual else 1.0
     weight_covariance(
-        b.rows,
-        b.surface[:count],
-        b.weight,
-        options.mode == PERCEPTUAL,
-        options.floor,
+        p,
+        b.surface,
         b.scattered,
         drift,
         out.parameters[s],
-        OUTLIER_SPREAD if options.mode == PERCEPTUAL else 1.0,
+        spread,
         out.covariance[s],
         work,
     )
@@ -169,7 +116,7 @@ def _write_held_error(
     block: Block,
     tables: Tables,
     errors: JudgedErrors,
-    out: JudgedFit,
+    out: SurfaceFit,
     b: Lumitexel,
     work: FitMemory,
 ) -> None:
@@ -183,53 +130,65 @@ def _write_held_error(
 
 
 @kernel
-def judge_block(
-    block: Block, tables: Tables, options: Options, errors: JudgedErrors, out: JudgedFit
+def fit_block(
+    block: Block,
+    tables: Tables,
+    options: Options,
+    errors: JudgedErrors,
+    out: SurfaceFit,
 ) -> None:
-    """Fit, or only evaluate, every surfel of a block by a reduced basis; its errors,
-    held-out samples and outliers.
+    """Fit, or only evaluate, every surfel of a block; its errors, held-out samples and
+    outliers.
 
-    The lift (m, m) is the identity. Every block of samples is read only once.
+    Errors and held-out samples need a square lift. Every block of samples is read only
+    once.
     """
     table = tables.table
     lift = tables.lift
     b = block_memory(block, table.shape[3])
     work = fit_memory(b.pairs.shape[0], table.shape[3], lift.shape[1])
-    turning = turn_memory(*errors.held.shape, table.shape[3])
+    turning = turn_memory(block.light.shape[0], block.camera.shape[0], table.shape[3])
     kinds = held_kinds(errors.held)
     for s in range(block.position.shape[0]):
         x = out.parameters[s]
-        if prepare(s, block, options, b) != FITTED:
+        out.status[s] = prepare(s, block, options, b)
+        if out.status[s] != FITTED:
             x[:] = np.nan
             continue
         choose_kind(0, errors.held, b)
         count = write_rows(block.normal[s], table, b)
-        matt = count < options.min_samples
-        matt = matt if options.solve else not np.isfinite(x).all()
+        matt, seen = start_fit(s, count, options, b, out)
         split_diffuse(block.diffuse[s], count, b)
         weigh(s, count, block.noise, options, b)
+        problem = Problem(
+            b.rows,
+            b.target,
+            b.weight,
+            count,
+            lift,
+            options.mode == PERCEPTUAL,
+            options.floor,
+            KKT_TOLERANCE,
+        )
+        converged = True
         if matt:
             x[:] = 0.0
         elif options.solve:
-            seen = smallest_half_angle(count, b)
             _block_narrow(tables.half_width, options.min_width * seen, work)
-            _fit_rows(count, lift, options, x, b, work)
-            if options.mode == PERCEPTUAL:
-                predict(b.rows, count, x, b.surface, work.single)
-                weigh_outliers(count, options, b, work.root)
-                fit_one(_problem(count, lift, options, b), x, work)
-        predict(b.rows, count, x, b.surface, work.single)
+            converged = _solve(s, problem, options, b, work, out)
+        out.status[s] = fitted_status(matt, converged, block.diffuse[s])
+        predict(b.rows, count, coefficients(lift, x), b.surface, work.single)
         if out.counts.shape[2] > 0:
             out.outlier[s] = outliers(count, options, b, work.root, out.counts)
         if out.covariance.shape[1] > 0 and not matt:
-            _write_covariance(s, count, block, options, errors, out, b, work)
+            _write_covariance(s, problem, block, errors, out, b, work)
             if errors.turn[s] > 0.0:
                 add_turned(
                     block.normal[s],
                     errors.turn[s],
                     block.diffuse[s],
                     table,
-                    _problem(count, lift, options, b),
+                    problem,
                     options.eta,
                     x,
                     out.covariance[s],

@@ -16,7 +16,6 @@ import numpy as np
 from skindb.jit import fast_kernel, inline_fast_kernel, kernel
 from skindb.reflectance._lumitexel_kernels import (
     FITTED,
-    LAMBERT,
     MIN_COSINE_SURFACE,
     PERCEPTUAL,
     JudgedErrors,
@@ -28,13 +27,13 @@ from skindb.reflectance._lumitexel_kernels import (
     choose_kind,
     cosine_between,
     fitted_status,
+    held_kinds,
     outliers,
     prepare,
     relative_drift,
-    relative_errors,
     root_memory,
-    smallest_half_angle,
     split_diffuse,
+    start_fit,
     surface_factor,
     turned_normals,
     weigh,
@@ -42,7 +41,7 @@ from skindb.reflectance._lumitexel_kernels import (
     write_samples,
 )
 from skindb.reflectance._shade_kernels import fall_off, to_lamp, transmittance
-from skindb.reflectance.model import Block, JudgedFit, SurfaceFit
+from skindb.reflectance.model import Block, SurfaceFit
 from skindb.types import Cube, Matrix, Matrix32, Vector
 
 MIN_ROUGHNESS = 0.05  # narrower lobes fall between the lights of a dome
@@ -281,47 +280,6 @@ def _certificate(count: int, x: Vector, lobe: Lobe) -> tuple[float, float]:
 
 
 @kernel
-def _lobe_errors(
-    count: int, x: Vector, b: Lumitexel, lobe: Lobe
-) -> tuple[float, float]:
-    """Relative errors of the prediction of the chosen samples by x (2,)."""
-    _write_values(count, x[ROUGHNESS], lobe)
-    for r in range(count):
-        for c in range(3):
-            b.scattered[c, r] += x[STRENGTH] * lobe.value[r]
-    return relative_errors(count, b)
-
-
-@kernel
-def fit_ggx(block: Block, index: float, options: Options, out: SurfaceFit) -> None:
-    """Fit every surfel of a block."""
-    b = block_memory(block, 0)
-    lobe = lobe_memory(b.pairs.shape[0])
-    for s in range(block.position.shape[0]):
-        out.status[s] = prepare(s, block, options, b)
-        if out.status[s] != FITTED:
-            continue
-        count = write_samples(b)
-        out.samples[s] = count
-        out.half_angle[s] = math.degrees(smallest_half_angle(count, b))
-        write_lobe(block.diffuse[s], count, index, b, lobe)
-        if count < options.min_samples:
-            matt = fitted_status(True, block.diffuse[s])
-            out.status[s] = LAMBERT if matt == FITTED else matt
-            none = np.array([0.0, 1.0])
-            out.residual[s], out.residual_perceptual[s] = _lobe_errors(
-                count, none, b, lobe
-            )
-            continue
-        weigh(s, count, block.noise, options, b)
-        x = out.parameters[s]
-        out.iterations[s], converged = _solve(count, options, x, b, lobe)
-        out.status[s] = fitted_status(converged, block.diffuse[s])
-        out.kkt[s], out.condition[s] = _certificate(count, x, lobe)
-        out.residual[s], out.residual_perceptual[s] = _lobe_errors(count, x, b, lobe)
-
-
-@kernel
 def _write_covariance(
     count: int, drift: Vector, x: Vector, b: Lumitexel, lobe: Lobe, out: Matrix
 ) -> None:
@@ -368,7 +326,7 @@ def _add_turned(
     index: float,
     options: Options,
     errors: JudgedErrors,
-    out: JudgedFit,
+    out: SurfaceFit,
     b: Lumitexel,
     lobe: Lobe,
 ) -> None:
@@ -387,8 +345,20 @@ def _add_turned(
 
 
 @kernel
-def judge_ggx(
-    block: Block, index: float, options: Options, errors: JudgedErrors, out: JudgedFit
+def _predict(count: int, x: Vector, b: Lumitexel, lobe: Lobe) -> None:
+    """Write the surface part of the chosen samples for x (2,)."""
+    _write_values(count, x[ROUGHNESS], lobe)
+    for r in range(count):
+        b.surface[r] = x[STRENGTH] * lobe.value[r]
+
+
+@kernel
+def fit_ggx(
+    block: Block,
+    index: float,
+    options: Options,
+    errors: JudgedErrors,
+    out: SurfaceFit,
 ) -> None:
     """Fit, or only evaluate, every surfel of a block; its errors, held-out samples and
     outliers.
@@ -397,28 +367,29 @@ def judge_ggx(
     root = root_memory(b.pairs.shape[0])
     lobe = lobe_memory(b.pairs.shape[0])
     drift = np.empty(3)
+    kinds = held_kinds(errors.held)
     for s in range(block.position.shape[0]):
         x = out.parameters[s]
         d = block.diffuse[s]
-        if prepare(s, block, options, b) != FITTED:
+        out.status[s] = prepare(s, block, options, b)
+        if out.status[s] != FITTED:
             x[:] = np.nan
             continue
         choose_kind(0, errors.held, b)
         count = write_samples(b)
-        matt = count < options.min_samples
-        matt = matt if options.solve else not np.isfinite(x).all()
-        if matt:
-            x[STRENGTH] = 0.0
-            x[ROUGHNESS] = 1.0
+        matt, _ = start_fit(s, count, options, b, out)
         write_lobe(d, count, index, b, lobe)
         weigh(s, count, block.noise, options, b)
-        if options.solve and not matt:
-            _solve(count, options, x, b, lobe)
-        else:
-            _write_values(count, x[ROUGHNESS], lobe)
+        converged = True
+        if matt:
+            x[STRENGTH], x[ROUGHNESS] = 0.0, 1.0
+        elif options.solve:
+            out.iterations[s], converged = _solve(count, options, x, b, lobe)
+            out.kkt[s], out.condition[s] = _certificate(count, x, lobe)
+        out.status[s] = fitted_status(matt, converged, d)
+        _predict(count, x, b, lobe)
+        if matt or not options.solve:
             _write_weights(count, options, x[STRENGTH], b, lobe)
-        for r in range(count):
-            b.surface[r] = x[STRENGTH] * lobe.value[r]
         if out.counts.shape[2] > 0:
             out.outlier[s] = outliers(count, options, b, root, out.counts)
         with_errors = out.covariance.shape[1] > 0 and x[STRENGTH] > 0.0
@@ -429,11 +400,13 @@ def judge_ggx(
         if with_errors and errors.turn[s] > 0.0:
             _add_turned(s, count, block, index, options, errors, out, b, lobe)
         for kind in range(1, 3):
-            choose_kind(kind, errors.held, b)
-            count = write_samples(b)
-            write_lobe(d, count, index, b, lobe)
-            error = _lobe_errors(count, x, b, lobe)
-            out.held_error[s, kind - 1, 0], out.held_error[s, kind - 1, 1] = error
+            if kinds[kind]:
+                choose_kind(kind, errors.held, b)
+                count = write_samples(b)
+                write_lobe(d, count, index, b, lobe)
+                _predict(count, x, b, lobe)
+                error = add_surface(count, b)
+                out.held_error[s, kind - 1, 0], out.held_error[s, kind - 1, 1] = error
         if matt:
             x[:] = np.nan
 

@@ -25,7 +25,7 @@ from skindb.reflectance._row_kernels import (
     row_memory,
 )
 from skindb.reflectance._shade_kernels import circular_reversal, transmittance
-from skindb.reflectance.model import Block, Noise
+from skindb.reflectance.model import Block, Noise, SurfaceFit
 from skindb.schema import FitStatus
 from skindb.schema.declaration import LARGEST_R_D, SMALLEST_R_D
 from skindb.types import (
@@ -460,14 +460,30 @@ def prepare(surfel: int, block: Block, options: Options, b: Lumitexel) -> int:
 
 
 @kernel
-def fitted_status(converged: bool, d: Vector) -> int:
+def start_fit(
+    surfel: int, count: int, options: Options, b: Lumitexel, out: SurfaceFit
+) -> tuple[bool, float]:
+    """Whether the chosen samples are too few for a surface, or given parameters are
+    those of none; and the smallest half angle [rad].
+    """
+    seen = smallest_half_angle(count, b)
+    out.samples[surfel] = count
+    out.half_angle[surfel] = math.degrees(seen)
+    if options.solve:
+        return count < options.min_samples, seen
+    return not np.isfinite(out.parameters[surfel]).all(), seen
+
+
+@kernel
+def fitted_status(matt: bool, converged: bool, d: Vector) -> int:
     """Status of a fitted surfel with R_d (3,)."""
     if not converged:
         return NOT_CONVERGED
     low = min(d[0], d[1], d[2])
     high = max(d[0], d[1], d[2])
-    clamped = low <= np.float32(SMALLEST_R_D) or high >= np.float32(LARGEST_R_D)
-    return CLAMPED if clamped else FITTED
+    if low <= np.float32(SMALLEST_R_D) or high >= np.float32(LARGEST_R_D):
+        return CLAMPED
+    return LAMBERT if matt else FITTED
 
 
 @kernel

@@ -383,18 +383,12 @@ def _fit_roots(p: Problem, x: Vector, work: FitMemory) -> int:
 
 @fast_kernel
 def _scores(
-    y: Vector32,
-    weight: Vector32,
-    perceptual: bool,
-    floor: float,
-    scattered: Matrix32,
-    drift: Vector,
-    work: FitMemory,
+    p: Problem, y: Vector32, scattered: Matrix32, drift: Vector, work: FitMemory
 ) -> None:
     """Write to `work`, per row at the solution, the slopes, the right side due to
     drift, and the squared scores.
     """
-    n = y.shape[0]
+    n = p.size
     channels = np.float32(scattered.shape[0])
     total = work.root.total
     a = work.slope
@@ -402,10 +396,10 @@ def _scores(
     square = work.root.trial
     for i in range(n):
         t[i], a[i] = ZERO, ONE
-    if perceptual:
-        slopes(y, np.float32(floor), a)
+    if p.perceptual:
+        slopes(y[:n], np.float32(p.floor), a)
     for i in range(n):
-        a[i] *= weight[i]
+        a[i] *= p.weight[i]
     for c in range(scattered.shape[0]):
         f = np.float32(drift[c])
         light = scattered[c]
@@ -420,11 +414,8 @@ def _scores(
 
 @kernel
 def weight_covariance(
-    rows: Matrix32,
+    problem: Problem,
     y: Vector32,
-    weight: Vector32,
-    perceptual: bool,
-    floor: float,
     scattered: Matrix32,
     drift: Vector,
     x: Vector,
@@ -435,8 +426,8 @@ def weight_covariance(
     """Covariance (m, m) of the positive weights, directly after `fit_one` with a square
     lift; NaN for the others.
 
-    `weight` (n,) are the weights of the rows in that fit, and `spread` is the factor by
-    which they make the first part too small.
+    `y` (n,) is the prediction, and `spread` the factor by which the weights of the rows
+    make the first part too small.
 
     The covariance has two parts: a sandwich estimate from the residuals of whole rows
     (White 1980), which is valid for noise of any size that the channels may share; and
@@ -444,7 +435,7 @@ def weight_covariance(
     `scattered` (channels, n).
     """
     m = x.shape[0]
-    n = y.shape[0]
+    n = problem.size
     G = work.reduced_gram
     b = work.reduced_right
     out[:] = np.nan
@@ -456,8 +447,8 @@ def weight_covariance(
             k += 1
     if k == 0 or n <= k:
         return
-    _scores(y, weight, perceptual, floor, scattered, drift, work)
-    gram(rows, n, work.slope, work.aim, G, b, work.block)
+    _scores(problem, y, scattered, drift, work)
+    gram(problem.rows, n, work.slope, work.aim, G, b, work.block)
     inverse = np.zeros((m, m))
     if not invert(G, active, k, work.gram, work.active_set.factor, inverse):
         return  # collinear columns: all their mixtures fit equally well
@@ -465,7 +456,7 @@ def weight_covariance(
     for p in range(k):
         for c in range(k):
             shift[p] += inverse[p, c] * b[active[c]]
-    gram(rows, n, work.root.trial, work.aim, G, b, work.block)
+    gram(problem.rows, n, work.root.trial, work.aim, G, b, work.block)
     for p in range(k):
         for c in range(k):
             total = 0.0

@@ -14,7 +14,6 @@ from skindb.reflectance._lumitexel_kernels import BINS, JudgedErrors, Options
 from skindb.reflectance.model import (
     Block,
     Comparison,
-    JudgedFit,
     Judgement,
     Lamp,
     Points,
@@ -60,10 +59,29 @@ def kernel_options(comparison: Comparison, *, solve: bool) -> Options:
     )
 
 
-def empty_fit(n: int, size: int, parameters: Array | None = None) -> SurfaceFit:
-    """Results before a fit of n surfels with `size` parameters, or with given ones."""
+def kernel_errors(block: Block, judgement: Judgement) -> JudgedErrors:
+    """The errors of the input of a judgement for the kernels, and the held-out samples."""
+    n = len(block.sample)
+    diffuse = np.zeros((n, 3))
+    if judgement.diffuse_error is not None:
+        diffuse = np.nan_to_num(judgement.diffuse_error.astype(np.float64))
+    turn = np.zeros(n)
+    if judgement.normal_error is not None:  # the RMS angle is that of two axes
+        angle = np.nan_to_num(np.float64(judgement.normal_error))
+        turn = np.radians(angle / np.sqrt(2))
+    held = np.zeros((0, 0), np.int64) if judgement.held is None else judgement.held
+    return JudgedErrors(diffuse, turn, held)
+
+
+def empty_fit(
+    block: Block, judgement: Judgement, size: int, parameters: Array | None = None
+) -> SurfaceFit:
+    """Results before a fit with `size` parameters, or with given ones."""
+    n, lights, cameras = block.sample.shape[:3]
     if parameters is None:
         parameters = np.full((n, size), np.nan)
+    columns = 0 if judgement.diffuse_error is None else size
+    bins = BINS if judgement.outliers else 0
     return SurfaceFit(
         parameters=np.array(parameters, np.float64, order="C"),
         kkt=np.full(n, np.nan),
@@ -74,34 +92,6 @@ def empty_fit(n: int, size: int, parameters: Array | None = None) -> SurfaceFit:
         half_angle=np.full(n, np.nan),
         iterations=np.zeros(n, np.int32),
         status=np.zeros(n, np.uint8),
-    )
-
-
-def empty_judgement(
-    block: Block, judgement: Judgement, size: int, parameters: Array | None = None
-) -> tuple[JudgedErrors, JudgedFit]:
-    """Input of a judgement for the kernels, and its results before they are computed, for
-    `size` parameters, or for given ones.
-    """
-    n, lights, cameras = block.sample.shape[:3]
-    diffuse = np.zeros((n, 3))
-    if judgement.diffuse_error is not None:
-        diffuse = np.nan_to_num(judgement.diffuse_error.astype(np.float64))
-    turn = np.zeros(n)
-    if judgement.normal_error is not None:  # the RMS angle is that of two axes
-        angle = np.nan_to_num(np.float64(judgement.normal_error))
-        turn = np.radians(angle / np.sqrt(2))
-    held = judgement.held
-    if held is None:
-        held = np.zeros((lights, cameras), np.int64)
-    if parameters is None:
-        parameters = np.full((n, size), np.nan)
-    columns = 0 if judgement.diffuse_error is None else size
-    bins = BINS if judgement.outliers else 0
-    return JudgedErrors(diffuse, turn, held), JudgedFit(
-        parameters=np.array(parameters, np.float64, order="C"),
-        residual=np.full(n, np.nan),
-        residual_perceptual=np.full(n, np.nan),
         covariance=np.full((n, columns, columns), np.nan),
         held_error=np.full((n, 2, 2), np.nan),
         outlier=np.full(n, np.nan),

@@ -28,18 +28,18 @@ from skindb.reflectance._ggx_kernels import (
 from skindb.reflectance.block import (
     FIT_VARIABLES,
     empty_fit,
-    empty_judgement,
     kernel_block,
+    kernel_errors,
     kernel_options,
     shade_diffuse,
 )
 from skindb.reflectance.lobes import evaluate_lobe
 from skindb.reflectance.model import (
     MAX_TABLES,
+    NO_JUDGEMENT,
     Block,
     Comparison,
     FitRequest,
-    JudgedFit,
     Judgement,
     Lamp,
     Points,
@@ -148,16 +148,29 @@ class GGX:
         """Strength and roughness (n, 2)."""
         return np.column_stack([fitted[name].values for name in self.PARAMETERS])
 
-    def fit(self, block: Block, comparison: Comparison) -> SurfaceFit:
-        """Strength and roughness of n surfels."""
-        out = empty_fit(len(block.sample), 2)
-        options = kernel_options(comparison, solve=True)
-        _ggx_kernels.fit_ggx(kernel_block(block), float(self.index), options, out)
+    def fit(
+        self,
+        block: Block,
+        comparison: Comparison,
+        judgement: Judgement = NO_JUDGEMENT,
+        parameters: Array | None = None,
+    ) -> SurfaceFit:
+        """Strength and roughness of n surfels, or given ones (n, 2), with their errors,
+        held-out samples and outliers.
+        """
+        out = empty_fit(block, judgement, len(self.PARAMETERS), parameters)
+        options = kernel_options(comparison, solve=parameters is None)
+        errors = kernel_errors(block, judgement)
+        _ggx_kernels.fit_ggx(
+            kernel_block(block), float(self.index), options, errors, out
+        )
         return out
 
     def fit_columns(self, fit: SurfaceFit) -> dict[str, Array]:
         """Variables of a fit."""
-        return dict(zip(self.fit_variables, [*fit.parameters.T, *fit[1:]], strict=True))
+        return dict(
+            zip(self.fit_variables, [*fit.parameters.T, *fit[1:]], strict=False)
+        )
 
     def reduced(
         self,
@@ -175,24 +188,7 @@ class GGX:
         }
         return dataset(shared)
 
-    def judge(
-        self,
-        block: Block,
-        comparison: Comparison,
-        judgement: Judgement,
-        parameters: Array | None = None,
-    ) -> JudgedFit:
-        """Strength and roughness of n surfels with their errors, held-out samples and
-        outliers.
-        """
-        errors, out = empty_judgement(block, judgement, 2, parameters)
-        options = kernel_options(comparison, solve=parameters is None)
-        _ggx_kernels.judge_ggx(
-            kernel_block(block), float(self.index), options, errors, out
-        )
-        return out
-
-    def judged_columns(self, judged: JudgedFit) -> dict[str, Array]:
+    def judged_columns(self, judged: SurfaceFit) -> dict[str, Array]:
         """Strength, roughness and the reflectance along the normal with their errors; those
         are NaN without a lobe.
         """

@@ -13,21 +13,21 @@ import xarray as xr
 
 from skindb.errors import input_error
 from skindb.reflectance import _row_kernels
-from skindb.reflectance._block_kernels import Tables, fit_block, judge_block
+from skindb.reflectance._block_kernels import Tables, fit_block
 from skindb.reflectance.block import (
     NO_TABLE,
     empty_fit,
-    empty_judgement,
     kernel_block,
+    kernel_errors,
     kernel_options,
     shade_tables,
 )
 from skindb.reflectance.dictionary import Dictionary, disc_dictionary
 from skindb.reflectance.model import (
+    NO_JUDGEMENT,
     Block,
     Comparison,
     FitRequest,
-    JudgedFit,
     Judgement,
     Lamp,
     Points,
@@ -219,23 +219,33 @@ class Mixture:
         return np.asarray(fitted[self.parameter_variables[0]].values)
 
     def fit(
-        self, block: Block, comparison: Comparison, parameters: Array | None = None
+        self,
+        block: Block,
+        comparison: Comparison,
+        judgement: Judgement = NO_JUDGEMENT,
+        parameters: Array | None = None,
     ) -> SurfaceFit:
-        """Weights of n surfels, or the residuals of given weights (n, m).
+        """Weights of n surfels, or given weights (n, m); their errors and held-out samples
+        only for tables that are not reduced.
 
         Samples below the noise floor are compared linearly; samples whose noise exceeds
         the error of models have less weight.
         """
-        count = self.matrix.shape[1]
-        out = empty_fit(len(block.sample), count, self._scaled(parameters))
         options = kernel_options(comparison, solve=parameters is None)
-        fit_block(kernel_block(block), self._tables, options, out)
+        if parameters is not None:
+            parameters = parameters * self.scale
+        out = empty_fit(block, judgement, len(self.scale), parameters)
+        tables = Tables(self.filled, self.matrix, self.half_width)
+        errors = kernel_errors(block, judgement)
+        fit_block(kernel_block(block), tables, options, errors, out)
         out.parameters[...] /= self.scale
+        if judgement.diffuse_error is not None:
+            out.covariance[...] /= np.multiply.outer(self.scale, self.scale)
         return out
 
     def fit_columns(self, fit: SurfaceFit) -> dict[str, Array]:
         """Variables of a fit by the dictionary."""
-        return dict(zip(DICTIONARY_VARIABLES, fit, strict=True))
+        return dict(zip(DICTIONARY_VARIABLES, fit, strict=False))
 
     def reduced(
         self, fitted: xr.Dataset, *, k: int, rng: np.random.Generator
@@ -261,26 +271,7 @@ class Mixture:
             basis[variables.MEAN_DICTIONARY_WEIGHT][:] = np.nan
         return basis
 
-    def judge(
-        self,
-        block: Block,
-        comparison: Comparison,
-        judgement: Judgement,
-        parameters: Array | None = None,
-    ) -> JudgedFit:
-        """Weights of n surfels with their errors, held-out samples and outliers;
-        only for tables that are not reduced.
-        """
-        count = self.matrix.shape[1]
-        errors, out = empty_judgement(block, judgement, count, self._scaled(parameters))
-        options = kernel_options(comparison, solve=parameters is None)
-        judge_block(kernel_block(block), self._tables, options, errors, out)
-        out.parameters[...] /= self.scale
-        if judgement.diffuse_error is not None:
-            out.covariance[...] /= np.multiply.outer(self.scale, self.scale)
-        return out
-
-    def judged_columns(self, judged: JudgedFit) -> dict[str, Array]:
+    def judged_columns(self, judged: SurfaceFit) -> dict[str, Array]:
         """Weights, their standard errors, and the reflectance along the normal with its
         error, which is NaN if no weight is above 0 or weights cannot be distinguished.
         """
@@ -342,14 +333,6 @@ class Mixture:
     def sampler(self) -> TableSampler:
         """Sampler of directions by the half vectors of the tables."""
         return TableSampler.of_tables(self.table)
-
-    @property
-    def _tables(self) -> Tables:
-        return Tables(self.filled, self.matrix, self.half_width)
-
-    def _scaled(self, parameters: Array | None) -> Array | None:
-        """Weights of the scaled tables."""
-        return None if parameters is None else parameters * self.scale
 
 
 def basis_rows(

@@ -69,6 +69,22 @@ class Comparison(NamedTuple):
     min_width: float = 0.0
 
 
+class Judgement(NamedTuple):
+    """What `ReflectanceModel.fit` finds in addition to parameters."""
+
+    # (n, 3) standard errors of R_d, and (n,) RMS angles to the true normals [degree];
+    # None to skip the errors of the parameters
+    diffuse_error: Array | None = None
+    normal_error: Array | None = None
+    # (lights, cameras) 0 for samples that are fitted, 1 under held-out lights, 2 in
+    # held-out cameras, 3 for both
+    held: Index | None = None
+    outliers: bool = False
+
+
+NO_JUDGEMENT = Judgement()
+
+
 class SurfaceFit(NamedTuple):
     """Results of a fit of n surfels; NaN where the status says that nothing was fitted."""
 
@@ -86,27 +102,6 @@ class SurfaceFit(NamedTuple):
     half_angle: Array
     iterations: AnyArray
     status: AnyArray
-
-
-class Judgement(NamedTuple):
-    """What `ReflectanceModel.judge` finds in addition to fitting."""
-
-    # (n, 3) standard errors of R_d, and (n,) RMS angles to the true normals [degree];
-    # None to skip the errors of the parameters
-    diffuse_error: Array | None = None
-    normal_error: Array | None = None
-    # (lights, cameras) 0 for samples that are fitted, 1 under held-out lights, 2 in
-    # held-out cameras, 3 for both
-    held: Index | None = None
-    outliers: bool = False
-
-
-class JudgedFit(NamedTuple):
-    """Results of `ReflectanceModel.judge` for n surfels."""
-
-    parameters: Array  # (n, p)
-    residual: Array  # (n,)
-    residual_perceptual: Array  # (n,)
     # (n, p, p) of the parameters that are not at a bound, NaN for the others; (n, 0, 0)
     # without errors
     covariance: Array
@@ -202,11 +197,19 @@ class ReflectanceModel(Protocol):
     def parameters_of(self, fitted: xr.Dataset) -> Array:
         """Parameters (n, p) in `parameter_variables`."""
 
-    def fit(self, block: Block, comparison: Comparison) -> SurfaceFit:
-        """Fit the surface term to the samples minus their diffuse part."""
+    def fit(
+        self,
+        block: Block,
+        comparison: Comparison,
+        judgement: Judgement = NO_JUDGEMENT,
+        parameters: Array | None = None,
+    ) -> SurfaceFit:
+        """Fit the surface term to the samples minus their diffuse part, or only evaluate
+        given parameters (n, p), and judge the prediction.
+        """
 
     def fit_columns(self, fit: SurfaceFit) -> dict[str, Array]:
-        """Variables of the surfels from `fit`: its parameters, and the other fields of
+        """Variables of the surfels from `fit`: its parameters, and the next fields of
         `SurfaceFit` under the names of `skindb.reflectance.block.FIT_VARIABLES`.
         """
 
@@ -217,17 +220,8 @@ class ReflectanceModel(Protocol):
         most k components, from the results of `fit` and `surfel_area`.
         """
 
-    def judge(
-        self,
-        block: Block,
-        comparison: Comparison,
-        judgement: Judgement,
-        parameters: Array | None = None,
-    ) -> JudgedFit:
-        """Fit, or only evaluate given parameters (n, p), and judge the prediction."""
-
-    def judged_columns(self, judged: JudgedFit) -> dict[str, Array]:
-        """Variables of the surfels from `judge`: parameters, their errors,
+    def judged_columns(self, judged: SurfaceFit) -> dict[str, Array]:
+        """Variables of the surfels from a fit with errors: parameters, their errors,
         `surface_reflectance` and `surface_reflectance_error`.
         """
 

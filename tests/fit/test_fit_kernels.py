@@ -15,11 +15,11 @@ import sys
 import skindb
 from skindb.fit._normal_kernels import normals_block
 from skindb.fit.kernels import STEPS, compile_step
-from skindb.reflectance._block_kernels import fit_block, judge_block
-from skindb.reflectance._ggx_kernels import fit_ggx, judge_ggx
+from skindb.reflectance._block_kernels import fit_block
+from skindb.reflectance._ggx_kernels import fit_ggx
 from skindb.reflectance._joint_kernels import fit_jointly
 from skindb.reflectance._separation_kernels import separate_block
-kernels = (fit_jointly, separate_block, fit_block, judge_block, fit_ggx, judge_ggx, normals_block)
+kernels = (fit_jointly, separate_block, fit_block, fit_ggx, normals_block)
 for step in STEPS:
     compile_step(step)
 before = [{*kernel.entry.signatures} for kernel in kernels]

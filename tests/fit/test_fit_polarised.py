@@ -55,7 +55,7 @@ def test_fit__mixtures_behind_polarisers(mode):
     held = np.zeros((40, 6), np.int64)
     held[::5] = 1
     errors = Judgement(np.zeros((3, 3)), np.full(3, 0.5), held)
-    judged = surface.judge(block, comparison, errors)
+    judged = surface.fit(block, comparison, errors)
     assert judged.held_error[:, 0].max() < 2e-3
 
 

@@ -225,11 +225,8 @@ def test_weight_covariance__is_the_sandwich_in_plain_numpy(perceptual):
     y = rows.astype(np.float64) @ x
     scattered = scattered.astype(np.float32)
     _mixture_kernels.weight_covariance(
-        filled,
+        problem,
         y.astype(np.float32),
-        weight,
-        perceptual,
-        floor,
         scattered,
         drift,
         x,
@@ -272,11 +269,8 @@ def test_weight_covariance__collinear_columns_have_none():
     _mixture_kernels.fit_one(problem, np.zeros(2), work)
     nothing = np.zeros((3, 50), np.float32), np.zeros(3)
     _mixture_kernels.weight_covariance(
-        filled,
+        problem,
         0 * ones,
-        ones,
-        False,
-        1.0,
         *nothing,
         np.full(2, 0.5),
         1.0,

@@ -116,7 +116,7 @@ def test_fit__recovers_lobes_behind_polarisers():
     fit = GGX(INDEX).fit(polarised, EXACT)
     np.testing.assert_allclose(fit.parameters[:, 0], STRENGTH, rtol=1e-3)
     np.testing.assert_allclose(fit.parameters[:, 1], ROUGHNESS, rtol=1e-3)
-    judged = GGX(INDEX).judge(polarised, EXACT, Judgement(), fit.parameters)
+    judged = GGX(INDEX).fit(polarised, EXACT, Judgement(), fit.parameters)
     assert max(fit.residual.max(), judged.residual.max()) < 1e-3
 
 
@@ -170,30 +170,30 @@ def test_fit__matte_hidden_and_empty_surfels():
     assert GGX(INDEX).fit(empty, EXACT).parameters.shape == (0, 2)
 
 
-def test_judge__fits_like_fit_and_predicts_what_is_held_out():
+def test_fit__fits_like_fit_and_predicts_what_is_held_out():
     block = planted(STRENGTH, ROUGHNESS)
     held = np.zeros((60, 9), np.int64)
     held[::7] = 1
     held[:, 4] += 2
     errors = Judgement(np.full((4, 3), 1e-3), np.full(4, 0.2), held, outliers=True)
-    judged = GGX(INDEX).judge(block, EXACT, errors)
+    judged = GGX(INDEX).fit(block, EXACT, errors)
     np.testing.assert_allclose(judged.parameters[:, 1], ROUGHNESS, rtol=1e-3)
     assert judged.held_error.max() < 1e-3
     assert judged.outlier.max() == 0
-    again = GGX(INDEX).judge(block, EXACT, errors, judged.parameters)
+    again = GGX(INDEX).fit(block, EXACT, errors, judged.parameters)
     np.testing.assert_allclose(again.held_error, judged.held_error, rtol=1e-6)
     np.testing.assert_array_equal(again.counts, judged.counts)
 
 
-def test_judge__evaluated_parameters_have_the_errors_of_their_fit():
+def test_fit__evaluated_parameters_have_the_errors_of_their_fit():
     block = planted(STRENGTH, ROUGHNESS, noise=0.05, seed=3)
     errors = Judgement(np.full((4, 3), 1e-3), np.full(4, 0.2))
-    judged = GGX(INDEX).judge(block, EXACT, errors)
-    again = GGX(INDEX).judge(block, EXACT, errors, judged.parameters)
+    judged = GGX(INDEX).fit(block, EXACT, errors)
+    again = GGX(INDEX).fit(block, EXACT, errors, judged.parameters)
     np.testing.assert_allclose(again.covariance, judged.covariance, rtol=1e-9)
 
 
-def test_judge__errors_are_the_scatter_of_repeated_fits():
+def test_fit__errors_are_the_scatter_of_repeated_fits():
     repeats = 60
     model = GGX(INDEX)
     judgement = Judgement(np.zeros((repeats, 3)))
@@ -211,7 +211,7 @@ def test_judge__errors_are_the_scatter_of_repeated_fits():
         light=one.light,
         camera=one.camera,
     )
-    judged = model.judge(block, EXACT, judgement)
+    judged = model.fit(block, EXACT, judgement)
     columns = model.judged_columns(judged)
     for name in ("lobe_strength", "lobe_roughness", "surface_reflectance"):
         scatter = columns[name].std(ddof=1)

@@ -62,12 +62,12 @@ def _refits(model, samples, s, x):
     return variance
 
 
-def test_judge__error_of_the_normal_as_refits_of_all_samples(samples):
+def test_fit__error_of_the_normal_as_refits_of_all_samples(samples):
     model = _mixture()
     comparison = Comparison("linear", ETA, NOISE_FLOOR_SURFACE, MIN_SAMPLES_GLOSS)
     errors = np.zeros((SURFELS, 3))
     given, exact = (
-        model.judge(samples.block, comparison, Judgement(errors, normal_error))
+        model.fit(samples.block, comparison, Judgement(errors, normal_error))
         for normal_error in (np.full(SURFELS, TURN), None)
     )
     part = np.diagonal(given.covariance - exact.covariance, axis1=1, axis2=2)
@@ -84,7 +84,7 @@ def test_judge__error_of_the_normal_as_refits_of_all_samples(samples):
     assert len(ratio) > 40
 
 
-def test_judge__error_of_the_normal_in_cube_root_space_uses_all_samples(samples):
+def test_fit__error_of_the_normal_in_cube_root_space_uses_all_samples(samples):
     # the order of the lights decides which samples would be computed anew
     order = np.random.default_rng(5).permutation(len(samples.block.light))
     shuffled = samples.block._replace(
@@ -95,7 +95,7 @@ def test_judge__error_of_the_normal_in_cube_root_space_uses_all_samples(samples)
     judgement = Judgement(np.zeros((SURFELS, 3)), np.full(SURFELS, TURN))
     one, other = (
         np.diagonal(
-            _mixture().judge(block, comparison, judgement).covariance, axis1=1, axis2=2
+            _mixture().fit(block, comparison, judgement).covariance, axis1=1, axis2=2
         )
         for block in (samples.block, shuffled)
     )
