@@ -2,15 +2,12 @@
 
 LLVM vectorises loops only if their width is constant, and a call with many arrays costs
 more than a step of a few vectors. These steps are therefore written with explicit vector
-instructions and inlined, and again as plain loops. With SKINDB_INTRINSICS=0 in the
-environment the plain loops are used, for processors or versions of LLVM on which the
-vector code does not compile. The fit then takes about four times the CPU time.
+instructions and inlined.
 """
 
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar, cast
@@ -23,7 +20,7 @@ from numba.extending import intrinsic, overload
 from numpy.typing import NDArray
 
 from skindb.kernel_compiler import Kernel
-from skindb.types import Integer, IntVector32, Matrix32, Real, Vector32
+from skindb.types import IntVector32, Matrix32, Vector32
 
 # a kernel keeps its signature for mypy, which checks its callers
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -33,8 +30,6 @@ FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
 # without the GIL; a division by zero gives inf, because tests for it would prevent
 # vectorised loops
 OPTIONS: dict[str, Any] = {"nopython": True, "nogil": True, "error_model": "numpy"}
-# 0: only code that Numba compiles itself, see the vector steps below
-INTRINSICS = os.environ.get("SKINDB_INTRINSICS", "1") != "0"
 
 
 def kernel(function: Function) -> Function:
@@ -275,68 +270,6 @@ def bits_float(_typing: Any, bits: Any) -> Any:
     return types.float32(bits), codegen
 
 
-@inline_fast_kernel
-def plain_blend(
-    table: Matrix32,
-    places: tuple[Integer, ...],
-    weights: tuple[Real, ...],
-    rows: Matrix32,
-    row: int,
-) -> None:
-    """`vector_blend` as loops."""
-    width = rows.shape[1]
-    flat = table.reshape(-1)
-    for j in range(width):
-        rows[row, j] = np.float32(0)
-    for c in range(len(places)):
-        for j in range(width):
-            rows[row, j] += weights[c] * flat[places[c] + j]
-
-
-@kernel
-def plain_products(
-    rows: Matrix32,
-    weight: Vector32,
-    target: Vector32,
-    left: int,
-    right: int,
-    begin: int,
-    end: int,
-    out: Matrix32,
-) -> None:
-    """`vector_products` as loops."""
-    out[:] = np.float32(0)
-    for i in range(begin, end):
-        for j in range(LANES):
-            weighted = rows[i, right + j] * weight[i]
-            for k in range(LANES):
-                out[k, j] += rows[i, left + k] * weighted
-            out[LANES, j] += target[i] * rows[i, right + j]
-
-
-@kernel
-def plain_dots(rows: Matrix32, factors: Vector32, count: int, out: Vector32) -> None:
-    """`vector_dots` as loops."""
-    for i in range(count):
-        total = np.float32(0)
-        for j in range(rows.shape[1]):
-            total += rows[i, j] * factors[j]
-        out[i] = total
-
-
-@kernel
-def plain_half(bits: Any) -> Any:
-    """`vector_half` with a table."""
-    return HALVES[bits]
-
-
-HALVES = np.arange(1 << 16, dtype=np.uint16).view(np.float16).astype(np.float32)
-blend = vector_blend if INTRINSICS else plain_blend
-products = vector_products if INTRINSICS else plain_products
-dots = vector_dots if INTRINSICS else plain_dots
-half = vector_half if INTRINSICS else plain_half
-
-
 def single(value: Any) -> Any:
     """A sample in single precision; half floats are passed as their bits, see `sample_bits`."""
     return value
@@ -345,7 +278,7 @@ def single(value: Any) -> Any:
 @overload(single, inline="always", strict=False)
 def _single(value: Any) -> Any:
     if value == types.uint16:
-        return lambda value: half(value)
+        return lambda value: vector_half(value)
     return lambda value: value
 
 

@@ -1,12 +1,6 @@
-"""Steps with explicit vectors, and the equivalent plain loops, compared with NumPy in
-double precision.
-"""
+"""Steps with explicit vectors compared with NumPy in double precision."""
 
 from __future__ import annotations
-
-import os
-import subprocess
-import sys
 
 import numba as nb
 import numpy as np
@@ -16,12 +10,12 @@ from skindb import jit
 from skindb.jit import LANES
 
 ROUNDING = 1e-6  # error of sums in single precision relative to their largest terms
-WAYS = ("vector", "plain")
 
 
-def _compiled(way):
+@pytest.fixture(scope="module")
+def calls():
     blend, products, dots, half = (
-        getattr(jit, f"{way}_{name}") for name in ("blend", "products", "dots", "half")
+        getattr(jit, f"vector_{name}") for name in ("blend", "products", "dots", "half")
     )
 
     @nb.njit
@@ -53,11 +47,6 @@ def _compiled(way):
         "dots": call_dots,
         "half": call_half,
     }
-
-
-@pytest.fixture(scope="module", params=WAYS)
-def calls(request):
-    return _compiled(request.param)
 
 
 @pytest.mark.parametrize("width", [LANES, 3 * LANES])
@@ -109,36 +98,3 @@ def test_half__every_one(calls):
     out = np.empty(1 << 16, np.float32)
     calls["half"](bits, out)
     np.testing.assert_array_equal(out, bits.view(np.float16).astype(np.float32))
-
-
-PRINT_FIT = """
-from planted_skin import make_skin
-from skindb.fit import fit_surface
-from skindb.reflectance.dictionary import embedded_dictionary
-from skindb.reflectance.mixture import Mixture
-from skindb.schema import dataset
-skin = make_skin(surfels=5, lights=40, cameras=6)
-planted = {"shading_normal": skin.normal, "diffuse_reflectance": skin.diffuse}
-lumitexels = skin.lumitexels.merge(dataset(planted))
-surface = Mixture.of_dictionary(embedded_dictionary(), rank=8)
-found = fit_surface(lumitexels, surface=surface)
-for name in ("dictionary_residual", "dictionary_residual_perceptual"):
-    print(*found[name].values.ravel())
-"""
-
-
-@pytest.mark.slow
-def test_fit__the_same_without_intrinsics(tmp_path):
-    """Rationale: processors without these vector instructions use the plain loops."""
-    found = []
-    for setting in "01":
-        more = {"SKINDB_INTRINSICS": setting, "PYTHONPATH": "tests"}
-        if setting == "0":
-            more["NUMBA_CACHE_DIR"] = str(tmp_path)
-        call = [sys.executable, "-c", PRINT_FIT]
-        done = subprocess.run(
-            call, env=os.environ | more, capture_output=True, text=True, check=True
-        )
-        found.append(np.array(done.stdout.split(), float))
-    # sums have another order, so that iterations end at other values within their tolerance
-    np.testing.assert_allclose(found[0], found[1], rtol=1e-3, atol=1e-6)

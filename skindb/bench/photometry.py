@@ -13,7 +13,7 @@ from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.bench.surface import spiral, unit
 from skindb.calibration._merge_kernels import OK
 from skindb.calibration.radiance import merge_exposures
-from skindb.fit import estimate_diffuse_reflectance, estimate_normals, normals
+from skindb.fit import estimate_diffuse_reflectance, estimate_normals
 from skindb.format.frames import FrameKind
 from skindb.format.sensor import SensorRecord
 from skindb.optics.fresnel import fresnel_transmittance
@@ -144,13 +144,9 @@ def _domes(quick: bool) -> list[tuple[str, ModelSamples]]:
 
 
 def normals_curves(quick: bool) -> list[Curve]:
-    """Every method by size of the dome; all methods share one kernel, so the time only
-    depends on the dome.
-    """
-    points = []
+    """The estimate by size of the dome."""
     domes = _domes(quick)
-    for samples, skin in domes:
-        points += [_normals(skin, method, samples) for method in normals.METHODS]
+    points = [_normals(skin, samples) for samples, skin in domes]
     skin = domes[0][1]
     scan = skin.lumitexels[variables.SURFEL_NORMAL].values
     angle = float(np.median(_angles(scan, skin.normal)))
@@ -167,13 +163,13 @@ def normals_curves(quick: bool) -> list[Curve]:
     ]
 
 
-def _normals(skin: ModelSamples, method: str, samples: str) -> Point:
-    options: dict[str, Any] = {"eta": ETA, "scan_error": SCAN_ERROR, "method": method}
+def _normals(skin: ModelSamples, samples: str) -> Point:
+    options: dict[str, Any] = {"eta": ETA, "scan_error": SCAN_ERROR}
     estimate_normals(skin.lumitexels.isel(surfel=slice(0, 2)), **options)  # compiles
     work = partial(estimate_normals, skin.lumitexels, **options)
     seconds, estimate = cpu_time(work, len(skin.normal))
     angle = _angles(estimate[variables.SHADING_NORMAL].values, skin.normal)
-    return Point(method, samples, seconds, float(np.nanmedian(angle)))
+    return Point("combined", samples, seconds, float(np.nanmedian(angle)))
 
 
 def _angles(normal: Array, true: Array) -> Array:

@@ -19,7 +19,6 @@ from skindb.optics._photometric_kernels import (
 )
 from skindb.types import Matrix, Vector
 
-COMBINED, CHROMATIC, PHOTOMETRIC = range(3)
 # Terms of the total error that cover 91 to 96 % of the normals of six independent
 # captures with known truth: shadows, folds and residual highlights affect neighbouring
 # lights alike, which increases the angle between the two estimates the second in
@@ -114,18 +113,6 @@ def _combine(estimates: NormalEstimates, scan_error: float, out: Vector) -> floa
 
 
 @kernel
-def _choose(
-    method: int, estimates: NormalEstimates, combined: Vector, out: Vector
-) -> None:
-    """Write the normal of a method."""
-    for k in range(3):
-        if method == COMBINED:
-            out[k] = combined[k]
-        else:
-            out[k] = estimates.normal[0 if method == PHOTOMETRIC else 1, k]
-
-
-@kernel
 def _total_error(error: float, estimates: NormalEstimates) -> float:
     """Total error [degree] of the combined normal, whose standard error is given."""
     # skin without colour has only one of the two estimates
@@ -145,21 +132,19 @@ def normals_block(
     light: Matrix,
     camera: Matrix,
     scan: Matrix,
-    method: int,
     eta: float,
     scan_error: float,
     chosen: Matrix,
     error: Vector,
     total: Vector,
 ) -> None:
-    """Normals (n, 3) by the method, standard and total error (n,) [degree].
+    """Normals (n, 3), standard and total error (n,) [degree].
 
     `scan_error` is an angle [rad].
     """
     b = buffers(light.shape[0], camera.shape[0])
     start = np.empty(3)
     estimates = normal_estimates()
-    combined = np.empty(3)
     for s in range(position.shape[0]):
         _unit_normal(scan[s], start)
         estimate_normal(
@@ -173,12 +158,7 @@ def normals_block(
             b,
             estimates,
         )
-        share = _combine(estimates, scan_error, combined)
-        if method == PHOTOMETRIC:
-            share = 1.0
-        elif method == CHROMATIC:
-            share = 0.0
-        _choose(method, estimates, combined, chosen[s])
+        share = _combine(estimates, scan_error, chosen[s])
         error[s] = math.nan
         total[s] = math.nan
         if np.isfinite(chosen[s]).all():
@@ -186,5 +166,5 @@ def normals_block(
             if error[s] > MAX_ERROR_DEGREES:
                 chosen[s] = math.nan
                 error[s] = math.nan
-            elif method == COMBINED:
+            else:
                 total[s] = _total_error(error[s], estimates)

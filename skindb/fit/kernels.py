@@ -10,7 +10,7 @@ import numpy as np
 
 from skindb.elementwise import thread_count
 from skindb.fit.model import COMPILING
-from skindb.fit.normals import METHODS, surfel_normals
+from skindb.fit.normals import surfel_normals
 from skindb.jit import is_stored
 from skindb.reflectance._block_kernels import fit_block
 from skindb.reflectance._ggx_kernels import fit_ggx
@@ -67,4 +67,4 @@ def compile_step(step: str) -> None:
             model = kind.unfitted(FitRequest(1.3, 0.0, 16, 4))
             model.fit(block, comparison)
         case "normals":
-            surfel_normals(*block[:4], none, method=METHODS[0], eta=1.3, scan_error=3.0)
+            surfel_normals(*block[:4], none, eta=1.3, scan_error=3.0)

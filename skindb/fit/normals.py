@@ -13,29 +13,23 @@ from skindb.parameters import SCAN_ERROR_DEGREES
 from skindb.schema import check
 from skindb.types import Array
 
-# in the order of the codes in `_normal_kernels`
-METHODS = ("combined", "chromatic", "photometric")
-
 
 def estimate_normals(
     lumitexels: xr.Dataset,
     *,
-    method: str = "combined",
     eta: float = 1.3,
     scan_error: float = SCAN_ERROR_DEGREES,
 ) -> xr.Dataset:
     """Unit normals per surfel.
 
+    They are the mean by inverse variance of two estimates by robust photometric stereo: on
+    a low quantile over cameras of the mean channel, and on the colour difference of the
+    channels, which white highlights do not have.
+
     Parameters
     ----------
     lumitexels
         Samples with geometry, from `lumitexels`.
-    method
-        "photometric": robust photometric stereo on a low
-        quantile over cameras of the mean channel. "chromatic": the same on the colour
-        difference of the channels, which white highlights do not have. "combined": mean
-        of the last two by inverse variance; the most exact on captures with known
-        truth.
     eta
         Refractive index of the Fresnel factors.
     scan_error
@@ -49,8 +43,8 @@ def estimate_normals(
         to the noise of the samples and the error of the scan: 95 to 97 % of
         the angles lie below 1.73 times it on matte skin, 88 to 95 % on glossy skin,
         where residual highlights rotate normals without visible residuals; and
-        `normal_total_error` [degree] ("combined" alone), three times that, the angle
-        between the two estimates it combines, and one degree, in quadrature.
+        `normal_total_error` [degree], three times that, the angle
+        between the two estimates, and one degree, in quadrature.
 
     Notes
     -----
@@ -58,8 +52,6 @@ def estimate_normals(
     150, three 8 x 64, two 6 x 32): 22 to 47 % for `normal_error`, 91 to 96 % for
     `normal_total_error`, whose three numbers were chosen on them.
     """
-    if method not in METHODS:
-        raise ValueError(f"method must be one of {METHODS}, not {method!r}")
     check(lumitexels, (*GEOMETRY, "surfel_normal"), where="lumitexels")
     return elementwise(
         surfel_normals,
@@ -67,7 +59,6 @@ def estimate_normals(
         over="surfel",
         inputs=(*GEOMETRY, "surfel_normal"),
         outputs=("shading_normal", "normal_error", "normal_total_error"),
-        method=method,
         eta=eta,
         scan_error=scan_error,
     )
@@ -80,11 +71,10 @@ def surfel_normals(
     camera: Array,
     scan: Array,
     *,
-    method: str,
     eta: float,
     scan_error: float,
 ) -> tuple[Array, Array, Array]:
-    """(n, 3) normals by `method`, standard and total error (n,) [degree]."""
+    """(n, 3) normals, standard and total error (n,) [degree]."""
     n = len(position)
     chosen = np.empty((n, 3))
     error = np.empty(n)
@@ -98,7 +88,6 @@ def surfel_normals(
         light,
         camera,
         scan,
-        METHODS.index(method),
         float(eta),
         float(np.deg2rad(scan_error)),
         chosen,

@@ -1,4 +1,4 @@
-"""Compiled fit, judgement and shading of one GGX lobe; `skindb.reflectance.ggx` describes
+"""Compiled fit and judgement of one GGX lobe; `skindb.reflectance.ggx` describes
 the model.
 
 A surfel has a strength w and a roughness alpha. For a given alpha the best w is a ratio
@@ -25,24 +25,22 @@ from skindb.reflectance._lumitexel_kernels import (
     add_surface,
     block_memory,
     choose_kind,
-    cosine_between,
     fitted_status,
     held_kinds,
+    lobe_angles,
     outliers,
     prepare,
     relative_drift,
     root_memory,
     split_diffuse,
     start_fit,
-    surface_factor,
     turned_normals,
     weigh,
     write_cosines,
     write_samples,
 )
-from skindb.reflectance._shade_kernels import fall_off, to_lamp, transmittance
 from skindb.reflectance.model import Block, SurfaceFit
-from skindb.types import Cube, Matrix, Matrix32, Vector
+from skindb.types import Matrix, Vector
 
 MIN_ROUGHNESS = 0.05  # narrower lobes fall between the lights of a dome
 MAX_ROUGHNESS = 1.0
@@ -111,17 +109,13 @@ def write_lobe(d: Vector, count: int, index: float, b: Lumitexel, lobe: Lobe) ->
 @kernel
 def _write_angles(r: int, index: float, b: Lumitexel, lobe: Lobe) -> None:
     """Write what the lobe needs of the directions of a sample; 0 below the horizon."""
-    i = b.pairs[r, 0]
-    o = b.pairs[r, 1]
-    both = cosine_between(i, o, b)
-    light = b.lit[i]
-    camera = b.seen[o]
+    light = b.lit[b.pairs[r, 0]]
+    camera = b.seen[b.pairs[r, 1]]
+    square, fresnel = lobe_angles(r, index, b)
     above = light > 0.0 and camera > 0.0
     lobe.light[r] = light if above else 1.0
     lobe.camera[r] = camera if above else 1.0
-    lobe.half[r] = min((light + camera) ** 2 / max(2.0 + 2.0 * both, 1e-12), 1.0)
-    apart = math.sqrt(max((1.0 + both) / 2.0, 0.0))
-    fresnel = (1.0 - transmittance(min(apart, 1.0), index)) * surface_factor(r, b)
+    lobe.half[r] = min((light + camera) ** 2 / max(square, 1e-12), 1.0)
     lobe.fresnel[r] = fresnel * light if above else 0.0
 
 
@@ -376,7 +370,7 @@ def fit_ggx(
             x[:] = np.nan
             continue
         choose_kind(0, errors.held, b)
-        count = write_samples(b)
+        count = write_samples(block.normal[s], b)
         matt, _ = start_fit(s, count, options, b, out)
         write_lobe(d, count, index, b, lobe)
         weigh(s, count, block.noise, options, b)
@@ -402,48 +396,10 @@ def fit_ggx(
         for kind in range(1, 3):
             if kinds[kind]:
                 choose_kind(kind, errors.held, b)
-                count = write_samples(b)
+                count = write_samples(block.normal[s], b)
                 write_lobe(d, count, index, b, lobe)
                 _predict(count, x, b, lobe)
                 error = add_surface(count, b)
                 out.held_error[s, kind - 1, 0], out.held_error[s, kind - 1, 1] = error
         if matt:
             x[:] = np.nan
-
-
-@kernel
-def shade_ggx(
-    position: Matrix,
-    normal: Matrix,
-    view: Matrix,
-    parameters: Matrix,
-    place: Cube,
-    lit: Matrix32,
-    axis: Vector,
-    falloff: float,
-    index: float,
-    out: Matrix32,
-) -> None:
-    """Add the lobe to the radiance (n, 3) per unit of the light's radiant intensity."""
-    points = lit.shape[1]
-    for i in range(position.shape[0]):
-        cos_o = 0.0
-        for k in range(3):
-            cos_o += normal[i, k] * view[i, k]
-        if cos_o <= 0.0 or parameters[i, STRENGTH] == 0.0:
-            continue
-        gloss = 0.0
-        for p in range(points):
-            x, y, z, square = to_lamp(position[i], place[i, p])
-            cos_i = x * normal[i, 0] + y * normal[i, 1] + z * normal[i, 2]
-            both = x * view[i, 0] + y * view[i, 1] + z * view[i, 2]
-            if lit[i, p] <= 0.0 or cos_i <= 0.0:
-                continue
-            received = lit[i, p] * cos_i / square
-            received *= fall_off(axis, x, y, z, falloff)
-            half = min((cos_i + cos_o) ** 2 / max(2.0 + 2.0 * both, 1e-12), 1.0)
-            value, _ = lobe_value(cos_i, cos_o, half, parameters[i, ROUGHNESS])
-            apart = min(math.sqrt(max((1.0 + both) / 2.0, 0.0)), 1.0)
-            gloss += received * value * (1.0 - transmittance(apart, index))
-        for c in range(3):
-            out[i, c] += parameters[i, STRENGTH] * gloss / points

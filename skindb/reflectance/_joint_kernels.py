@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skindb.jit import LANES, fast_kernel, kernel, unpack
+from skindb.jit import LANES, fast_kernel, inline_fast_kernel, kernel, unpack
 from skindb.numerics._nnls_kernels import (
     ActiveSetMemory,
     active_set_memory,
@@ -32,13 +32,12 @@ from skindb.reflectance._lumitexel_kernels import (
     RootMemory,
     block_memory,
     choose,
-    cosine_between,
+    lobe_angles,
     root_memory,
     sample_status,
     slopes,
     smallest_half_angle,
     split_diffuse,
-    surface_factor,
     weigh,
     weigh_outliers,
     write_cosines,
@@ -47,7 +46,6 @@ from skindb.reflectance._lumitexel_kernels import (
     write_samples,
 )
 from skindb.reflectance._mixture_kernels import gram
-from skindb.reflectance._shade_kernels import transmittance
 from skindb.reflectance.model import Block
 from skindb.types import IntVector, Matrix, Matrix32, Vector, Vector32
 
@@ -181,13 +179,8 @@ def joint_memory(lights: int, cameras: int) -> JointMemory:
 def _write_angles(count: int, index: float, b: Lumitexel, m: JointMemory) -> None:
     """Write what the lobes need of the directions, whatever the normal."""
     for r in range(count):
-        i = b.pairs[r, 0]
-        o = b.pairs[r, 1]
-        both = cosine_between(i, o, b)
-        apart = math.sqrt(max((1.0 + both) / 2.0, 0.0))
-        reflected = 1.0 - transmittance(min(apart, 1.0), index)
-        m.fresnel[r] = reflected * surface_factor(r, b)
-        m.nearness[r] = 1.0 / max(2.0 + 2.0 * both, 1e-9)
+        square, m.fresnel[r] = lobe_angles(r, index, b)
+        m.nearness[r] = 1.0 / max(square, 1e-9)
 
 
 @kernel
@@ -204,6 +197,21 @@ def _face(
             m.seen[o, j] = math.sqrt(square[j] + (1.0 - square[j]) * b.seen[o] ** 2)
 
 
+@inline_fast_kernel
+def _facing(
+    r: int, b: Lumitexel, m: JointMemory
+) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """Cosines to light and camera of a sample, 1 below the horizon, where the strength of
+    the lobes is 0; squared cosine of the half vector, and that strength.
+    """
+    light = np.float32(b.lit[b.pairs[r, 0]])
+    camera = np.float32(b.seen[b.pairs[r, 1]])
+    half = min((light + camera) * (light + camera) * m.nearness[r], ONE)
+    above = light > 0 and camera > 0
+    strength = m.fresnel[r] * light * HALF_PER_PI if above else ZERO
+    return light if above else ONE, camera if above else ONE, half, strength
+
+
 @fast_kernel
 def _write_columns(count: int, square: Vector32, b: Lumitexel, m: JointMemory) -> None:
     """Write the diffuse shape and the lobes, D F G / (4 cos_o) of GGX with the
@@ -212,14 +220,8 @@ def _write_columns(count: int, square: Vector32, b: Lumitexel, m: JointMemory) -
     for r in range(count):
         i = b.pairs[r, 0]
         o = b.pairs[r, 1]
-        light = np.float32(b.lit[i])
-        camera = np.float32(b.seen[o])
+        light, camera, half, strength = _facing(r, b, m)
         m.table[r, DIFFUSE] = b.enters[i] * b.leaves[o]
-        half = min((light + camera) * (light + camera) * m.nearness[r], ONE)
-        above = light > 0 and camera > 0
-        strength = m.fresnel[r] * light * HALF_PER_PI if above else np.float32(0)
-        camera = camera if above else ONE
-        light = light if above else ONE
         for j in range(LOBES):
             q = half * (square[j] - ONE) + ONE
             shadow = camera * m.lit[i, j] + light * m.seen[o, j]
@@ -237,15 +239,9 @@ def _write_turned(
     for r in range(count):
         i = b.pairs[r, 0]
         o = b.pairs[r, 1]
-        light = np.float32(b.lit[i])
-        camera = np.float32(b.seen[o])
-        half = min((light + camera) * (light + camera) * m.nearness[r], ONE)
-        above = light > 0 and camera > 0
-        strength = m.fresnel[r] * light * HALF_PER_PI if above else np.float32(0)
+        light, camera, half, strength = _facing(r, b, m)
         shape = np.float32(b.enters[i] * b.leaves[o])
-        camera = camera if above else ONE
-        light = light if above else ONE
-        change = np.float32(0)
+        change = ZERO
         for j in range(LOBES):
             q = half * (square[j] - ONE) + ONE
             shadow = camera * m.lit[i, j] + light * m.seen[o, j]
@@ -698,4 +694,4 @@ def fit_jointly(block: Block, lobes: Lobes, o: Options, out: JointFit) -> None:
         write_cosines(n, o.eta, MIN_COSINE_SURFACE, b)
         if choose(b) < MIN_SAMPLES_LAMBERT:
             continue
-        _fit(s, write_samples(b), block, lobes, o, b, m, out)
+        _fit(s, write_samples(n, b), block, lobes, o, b, m, out)

@@ -292,6 +292,17 @@ def surface_factor(r: int, b: Lumitexel) -> float:
 
 
 @kernel
+def lobe_angles(r: int, index: float, b: Lumitexel) -> tuple[float, float]:
+    """Squared length of the sum of the directions of sample r, and the Fresnel factor of
+    a surface with this refractive index behind polarisers.
+    """
+    both = cosine_between(b.pairs[r, 0], b.pairs[r, 1], b)
+    apart = math.sqrt(max((1.0 + both) / 2.0, 0.0))
+    reflected = 1.0 - transmittance(min(apart, 1.0), index)
+    return 2.0 + 2.0 * both, reflected * surface_factor(r, b)
+
+
+@kernel
 def write_cosines(n: Vector, eta: float, min_cosine: float, b: Lumitexel) -> None:
     """Write cosines and transmission factors for all directions; 0 below the limit."""
     transmission(n, b.to_light, eta, min_cosine, b.lit, b.enters)
@@ -357,32 +368,23 @@ def write_rows(n: Vector, table: Tensor32, b: Lumitexel) -> int:
     """Write the rows of the chosen samples for this normal, and the samples; returns
     their number.
     """
-    memory = b.row_memory
-    count = list_rows(n, b.to_light, b.to_camera, b.usable, b.gloss, memory, b.pairs)
-    interpolate_rows(table, n, count, memory.way, memory, b.rows)
+    count = write_samples(n, b)
+    interpolate_rows(table, n, count, b.row_memory.way, b.row_memory, b.rows)
+    return count
+
+
+@kernel
+def write_samples(n: Vector, b: Lumitexel) -> int:
+    """Write the chosen samples, which are above the horizon; returns their number."""
+    count = list_rows(
+        n, b.to_light, b.to_camera, b.usable, b.gloss, b.row_memory, b.pairs
+    )
     cameras = b.seen.shape[0]
     for r in range(count):
         at = 3 * (b.pairs[r, 0] * cameras + b.pairs[r, 1])
         for c in range(3):
             b.sample[c, r] = b.values[at + c]
     return int(count)
-
-
-@kernel
-def write_samples(b: Lumitexel) -> int:
-    """Write the chosen samples without rows, for models that need none; returns their
-    number.
-    """
-    cameras = b.seen.shape[0]
-    count = 0
-    for i in range(b.lit.shape[0]):
-        for o in range(cameras):
-            if b.usable[i, o]:
-                b.pairs[count, 0], b.pairs[count, 1] = i, o
-                for c in range(3):
-                    b.sample[c, count] = b.values[3 * (i * cameras + o) + c]
-                count += 1
-    return count
 
 
 @kernel
@@ -545,6 +547,16 @@ def _root_residuals(
 
 
 @kernel
+def _root_scale(
+    mean: float, floor: float, count: int, finite: int, root: RootMemory
+) -> float:
+    """Scale of the residuals in `root.size`, for the mean sample."""
+    level = max(mean, floor)
+    finest = MIN_ROOT_SCALE * level / np.cbrt(level * level + floor * floor)
+    return max(1.4826 * median_of(root.size, root.size_bits, count, finite), finest)
+
+
+@kernel
 def outliers(
     count: int, options: Options, b: Lumitexel, root: RootMemory, counts: IntCube
 ) -> float:
@@ -563,11 +575,7 @@ def outliers(
         steep += 1 if above else 0
     if steep < options.min_samples:
         return math.nan
-    level = max(mean, options.floor)
-    finest = (
-        MIN_ROOT_SCALE * level / np.cbrt(level * level + options.floor * options.floor)
-    )
-    scale = max(1.4826 * median_of(root.size, root.size_bits, count, steep), finest)
+    scale = _root_scale(mean, options.floor, count, steep, root)
     beyond = 0
     per_scale = BINS_PER_SCALE / scale
     for r in range(count):
@@ -589,12 +597,7 @@ def weigh_outliers(
     for r in range(count):
         root.trial[r] = abs(root.trial[r]) * math.sqrt(b.weight[r])
         root.size[r] = root.trial[r]
-    level = max(mean, options.floor)
-    finest = (
-        MIN_ROOT_SCALE * level / np.cbrt(level * level + options.floor * options.floor)
-    )
-    scale = 1.4826 * median_of(root.size, root.size_bits, count, count)
-    limit = OUTLIER_LIMIT * max(scale, finest)
+    limit = OUTLIER_LIMIT * _root_scale(mean, options.floor, count, count, root)
     for r in range(count):
         z = root.trial[r] / limit
         w = max(1.0 - z * z, 0.0)
@@ -666,13 +669,8 @@ def relative_drift(d: Vector, error: Vector, drift: Vector) -> None:
 
 
 @kernel
-def turned_normals(n: Vector, turn: float, out: Matrix) -> None:
-    """Write the normals (4, 3) that represent an error `turn` [rad] about either axis.
-
-    These are the points of the Gauss-Hermite rule with three points per axis, which is
-    correct to second order: a lobe that is sampled at its peak loses weight for a
-    rotation in any direction. Each of them has the weight 1/6.
-    """
+def tangents(n: Vector) -> Matrix:
+    """Two unit vectors (2, 3) perpendicular to n and to each other."""
     small = 0
     for k in range(3):
         small = k if abs(n[k]) < abs(n[small]) else small
@@ -681,6 +679,18 @@ def turned_normals(n: Vector, turn: float, out: Matrix) -> None:
     axes = np.empty((2, 3))
     _across(n, away, axes[0])
     _across(n, axes[0], axes[1])
+    return axes
+
+
+@kernel
+def turned_normals(n: Vector, turn: float, out: Matrix) -> None:
+    """Write the normals (4, 3) that represent an error `turn` [rad] about either axis.
+
+    These are the points of the Gauss-Hermite rule with three points per axis, which is
+    correct to second order: a lobe that is sampled at its peak loses weight for a
+    rotation in any direction. Each of them has the weight 1/6.
+    """
+    axes = tangents(n)
     for q in range(4):
         angle = SQRT_3 * turn * (1.0 if q % 2 == 0 else -1.0)
         for k in range(3):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skindb.jit import LANES, dots, fast_kernel, kernel, products
+from skindb.jit import LANES, fast_kernel, kernel, vector_dots, vector_products
 from skindb.numerics._nnls_kernels import (
     ActiveSetMemory,
     active_set_memory,
@@ -118,7 +118,7 @@ def gram(
         end = min(begin + ROWS_PER_SUM, n)
         for p in range(0, width, LANES):
             for q in range(p, width, LANES):
-                products(rows, a, t, p, q, begin, end, block)
+                vector_products(rows, a, t, p, q, begin, end, block)
                 for k in range(LANES):
                     for j in range(LANES):
                         G[p + k, q + j] += block[k, j]
@@ -136,7 +136,7 @@ def predict(rows: Matrix32, n: int, c: Vector, y: Vector32, single: Vector32) ->
     for j in range(c.shape[0]):
         single[j] = c[j]
     single[c.shape[0] :] = 0.0
-    dots(rows, single, n, y)
+    vector_dots(rows, single, n, y)
 
 
 @kernel

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from skindb.jit import blend, fast_kernel, inline_fast_kernel, kernel
+from skindb.jit import fast_kernel, inline_fast_kernel, kernel, vector_blend
 from skindb.types import (
     BoolCube,
     BoolMatrix,
@@ -62,7 +62,6 @@ ZERO, ONE, MIN_SQUARE, HALF_PI, PI = (
     np.float32(c) for c in (0.0, 1.0, 1e-30, math.pi / 2, math.pi)
 )
 NONE, STEP, TWO = (np.int32(c) for c in (0, 1, 2))
-THETA_H, THETA_D, PHI_D = range(3)
 CHUNK = 64  # rows whose cells are found together
 ROOT_HALF = np.float32(math.sqrt(0.5))
 SMALLEST_SINE = np.float32(1e-6)
@@ -115,25 +114,29 @@ def _angles(n: Triple, wi: Triple, wo: Triple) -> Triple:
     return theta_h, theta_d, phi if sin_h > 1e-7 else 0.0
 
 
+@inline_fast_kernel
+def cells(n: Triple, wi: Triple, wo: Triple, shape: tuple[int, ...]) -> Triple:
+    """Coordinates [cells] of two directions in a table of `shape`."""
+    theta_h, theta_d, phi = _angles(n, wi, wo)
+    return (
+        math.sqrt(theta_h * 2.0 / math.pi) * (shape[0] - 1),
+        theta_d * 2.0 / math.pi * (shape[1] - 1),
+        phi / math.pi * shape[2],
+    )
+
+
 @fast_kernel
-def _coordinates(
-    n: Triple, wi: Triple, wo: Matrix, count: int, shape: tuple[int, ...], out: Matrix
+def _write_places(
+    wi: Triple, wo: Matrix, count: int, shape: tuple[int, ...], out: Matrix
 ) -> None:
-    """Coordinates [cells] in a table of `shape`, out (3, count), of wi with the columns
-    of wo (3, count).
-    """
-    per_h = 2.0 / math.pi
-    per_d = (shape[1] - 1) * 2.0 / math.pi
-    per_phi = shape[2] / math.pi
+    """Write the `cells` of a direction with those in the columns of wo (3, count)."""
     for q in range(count):
-        theta_h, theta_d, phi = _angles(n, wi, (wo[0, q], wo[1, q], wo[2, q]))
-        out[0, q] = math.sqrt(theta_h * per_h) * (shape[0] - 1)
-        out[1, q] = theta_d * per_d
-        out[2, q] = phi * per_phi
+        place = cells((0.0, 0.0, 1.0), wi, (wo[0, q], wo[1, q], wo[2, q]), shape)
+        out[0, q], out[1, q], out[2, q] = place
 
 
 @inline_fast_kernel
-def _interpolate(
+def interpolate(
     table: Tensor32, x: float, y: float, z: float, factor: float, out: Vector32
 ) -> None:
     """out[:] = factor * trilinear table value at x, y, z in cells; NaN reads cell 0 and
@@ -333,7 +336,7 @@ def interpolate_rows(
         for q in range(size):
             a = np.int64(corner[q])
             b = np.int64(corner[CHUNK + q])
-            blend(
+            vector_blend(
                 flat,
                 (
                     a,
@@ -477,20 +480,14 @@ def average_disc(
             scale = 1.0 / math.sqrt(px * px + py * py + pz * pz)
             disc[0, q], disc[1, q], disc[2, q] = px * scale, py * scale, pz * scale
         # the angles are the same if the two directions are exchanged
-        _coordinates(
-            (0.0, 0.0, 1.0),
-            (wo[s, 0], wo[s, 1], wo[s, 2]),
-            disc,
-            count,
-            table.shape,
-            place,
-        )
+        towards = (wo[s, 0], wo[s, 1], wo[s, 2])
+        _write_places(towards, disc, count, table.shape, place)
         for q in range(count):
-            _interpolate(
+            interpolate(
                 table,
-                place[THETA_H, q],
-                place[THETA_D, q],
-                place[PHI_D, q],
+                place[0, q],
+                place[1, q],
+                place[2, q],
                 weights[q],
                 value,
             )

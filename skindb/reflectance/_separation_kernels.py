@@ -7,27 +7,25 @@ Sums over samples run in single precision and in vector registers; systems of eq
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.jit import (
     LANES,
-    dots,
     fast_kernel,
     inline_kernel,
     kernel,
     largest_finite,
-    products,
     scale_to_one,
     unpack,
+    vector_dots,
+    vector_products,
 )
 from skindb.numerics._nnls_kernels import (
     ActiveSetMemory,
     active_set_memory,
-    factor,
-    solve,
+    invert,
     solve_scaled,
 )
 from skindb.reflectance._lumitexel_kernels import (
@@ -37,10 +35,11 @@ from skindb.reflectance._lumitexel_kernels import (
     MODEL_ERROR,
     UNSEEN,
     Lumitexel,
+    block_memory,
     choose,
-    lumitexel_memory,
     sample_status,
     surface_factor,
+    tangents,
     write_cosines,
     write_directions,
     write_gloss,
@@ -48,10 +47,9 @@ from skindb.reflectance._lumitexel_kernels import (
     write_rows,
 )
 from skindb.reflectance._shade_kernels import transmittance
-from skindb.reflectance.model import Noise
+from skindb.reflectance.model import Block
 from skindb.types import (
     IntMatrix32,
-    IntVector,
     Matrix,
     Matrix32,
     Tensor32,
@@ -103,6 +101,7 @@ class Separation(NamedTuple):
     pull: Vector32  # (rows,) derivative of R_d with respect to each sample
     mixture: Vector32  # (2 COLUMNS,) weights of the columns in single precision
     gram: Matrix  # (COLUMNS, COLUMNS)
+    scaled: Matrix  # (COLUMNS, COLUMNS)
     right: Vector  # (COLUMNS,)
     x: Vector  # (COLUMNS,)
     active_set: ActiveSetMemory  # of COLUMNS columns, for `solve_scaled`
@@ -125,6 +124,7 @@ def separation_memory(samples: int) -> Separation:
         v[8],
         v[9],
         np.zeros(2 * COLUMNS, np.float32),
+        np.empty((COLUMNS, COLUMNS)),
         np.empty((COLUMNS, COLUMNS)),
         np.empty(COLUMNS),
         np.zeros(COLUMNS),
@@ -193,7 +193,7 @@ def _normal_equations(rows: Matrix32, n: int, s: Separation) -> None:
     s.gram[:] = 0.0
     s.right[:] = 0.0
     for begin in range(0, n, ROWS_PER_SUM):
-        products(
+        vector_products(
             rows, s.weight, s.aim, 0, 0, begin, min(begin + ROWS_PER_SUM, n), s.block
         )
         for j in range(COLUMNS):
@@ -263,7 +263,7 @@ def _predict(
     s.mixture[:] = ZERO
     for j in range(COLUMNS):
         s.mixture[begin + j] = x[j]
-    dots(rows, s.mixture, n, out)
+    vector_dots(rows, s.mixture, n, out)
 
 
 @kernel
@@ -305,14 +305,16 @@ def fit_shape(
         s.aim[:n] = ZERO
         return 0.0, 0.0
     _normal_equations(rows, n, s)
-    if not _shape_row(active, k, s):
+    inverse = np.empty((COLUMNS, COLUMNS))
+    if not invert(s.gram, active, k, s.scaled, s.active_set.factor, inverse):
         s.pull[:n] = ZERO
         s.aim[:n] = ZERO
         return s.x[SHAPE], math.nan
-    weights = s.x.copy()
+    s.right[:] = 0.0
+    for p in range(k):
+        s.right[active[p]] = inverse[place, p]
     _predict(rows, n, s.right, 0, s, s.predicted)
     meat = _pull(n, s)
-    s.x[:] = weights
     bend = max(slope / max(total, 1e-12), MIN_BEND)
     for i in range(n):
         s.aim[i] = s.pull[i] * s.residual[i] / (s.level[i] * np.float32(bend))
@@ -320,85 +322,19 @@ def fit_shape(
 
 
 @kernel
-def _shape_row(active: IntVector, k: int, s: Separation) -> bool:
-    """Write the row of the diffuse shape of the inverse Gram matrix of the active
-    columns to `s.right`.
+def _slide(axes: Matrix, eta: float, towards: Matrix, cosine: Vector) -> Matrix:
+    """Effect (devices, 4) of a rotation of the normal by one radian towards two axes
+    (2, 3): for each, change of the cosine and relative change of F_t.
     """
-    length = np.ones(COLUMNS)
-    z = np.empty(COLUMNS)
-    for p in range(k):
-        j = active[p]
-        length[j] = 1.0 / math.sqrt(s.gram[j, j]) if s.gram[j, j] > 0.0 else 0.0
-    for i in range(COLUMNS):
-        for j in range(COLUMNS):
-            s.gram[i, j] *= length[i] * length[j]
-    if factor(s.gram, active, 0, k, s.active_set.factor) >= 0:
-        return False
-    unit = np.zeros(COLUMNS)
-    unit[SHAPE] = 1.0
-    solve(s.active_set.factor, unit, active, k, z)
-    s.right[:] = 0.0
-    for p in range(k):
-        s.right[active[p]] = z[p] * length[active[p]] * length[SHAPE]
-    return True
-
-
-@kernel
-def _tangents(n: Vector, first: Vector, second: Vector) -> None:
-    """Two unit vectors perpendicular to n and to each other."""
-    small = 0
-    for k in range(3):
-        small = k if abs(n[k]) < abs(n[small]) else small
-    for k in range(3):
-        p = (k + 1) % 3
-        q = (k + 2) % 3
-        first[k] = n[p] * (1.0 if q == small else 0.0) - n[q] * (
-            1.0 if p == small else 0.0
-        )
-    size = math.sqrt(first[0] * first[0] + first[1] * first[1] + first[2] * first[2])
-    for k in range(3):
-        first[k] /= size
-    for k in range(3):
-        p = (k + 1) % 3
-        q = (k + 2) % 3
-        second[k] = n[p] * first[q] - n[q] * first[p]
-
-
-@kernel
-def _slide(
-    axes: Matrix, eta: float, b: Lumitexel, light: Matrix, camera: Matrix
-) -> None:
-    """Effect of a rotation of the normal by one radian towards two axes (2, 3): light
-    (lights, 6), camera (cameras, 4).
-
-    For each axis: change of the cosine, relative change of cos F_t (of F_t for
-    cameras), and for lights of the cosine.
-    """
-    for i in range(b.lit.shape[0]):
-        c = b.lit[i]
-        if c > 0.0:
-            steep = _relative_slope(c, eta)
+    moved = np.zeros((cosine.shape[0], 4))
+    for i in range(cosine.shape[0]):
+        if cosine[i] > 0.0:
+            steep = _relative_slope(cosine[i], eta)
             for q in range(2):
-                t = (
-                    axes[q, 0] * b.to_light[i, 0]
-                    + axes[q, 1] * b.to_light[i, 1]
-                    + axes[q, 2] * b.to_light[i, 2]
-                )
-                light[i, 3 * q] = t
-                light[i, 3 * q + 1] = t / c + t * steep
-                light[i, 3 * q + 2] = t / c
-    for o in range(b.seen.shape[0]):
-        c = b.seen[o]
-        if c > 0.0:
-            steep = _relative_slope(c, eta)
-            for q in range(2):
-                t = (
-                    axes[q, 0] * b.to_camera[o, 0]
-                    + axes[q, 1] * b.to_camera[o, 1]
-                    + axes[q, 2] * b.to_camera[o, 2]
-                )
-                camera[o, 2 * q] = t
-                camera[o, 2 * q + 1] = t * steep
+                for k in range(3):
+                    moved[i, 2 * q] += axes[q, k] * towards[i, k]
+                moved[i, 2 * q + 1] = moved[i, 2 * q] * steep
+    return moved
 
 
 @inline_kernel
@@ -446,10 +382,10 @@ def _turn_effect(
         pull = s.pull[r]
         square += shape * shape
         for q in range(2):
-            body = shape * (light[i, 3 * q + 1] + camera[o, 2 * q + 1])
-            lobes = mixed[r] * light[i, 3 * q + 2] - tilt * (
-                light[i, 3 * q] + camera[o, 2 * q]
-            )
+            closer = light[i, 2 * q] / b.lit[i]
+            body = shape * (closer + light[i, 2 * q + 1] + camera[o, 2 * q + 1])
+            bend = tilt * (light[i, 2 * q] + camera[o, 2 * q])
+            lobes = mixed[r] * closer - bend
             out[q, 0] += pull * (weight * body + lobes)
             out[q, 1] += shape * body
     for q in range(2):
@@ -483,16 +419,14 @@ def _normal_effect(
     n: Vector, eta: float, count: int, b: Lumitexel, s: Separation
 ) -> Matrix:
     """`_turn_effect` (2 axes, 2) of the mixture of lobes in `s.x`."""
-    axes = np.empty((2, 3))
+    axes = tangents(n)
     moved = np.empty((2, 2))
-    _tangents(n, axes[0], axes[1])
-    light = np.empty((b.lit.shape[0], 6))
-    camera = np.empty((b.seen.shape[0], 4))
     lobes = s.x.copy()
     lobes[SHAPE] = 0.0
     _predict(b.rows, count, lobes, 0, s, s.predicted)
     _predict(b.rows, count, lobes, COLUMNS, s, s.level)
-    _slide(axes, eta, b, light, camera)
+    light = _slide(axes, eta, b.to_light, b.lit)
+    camera = _slide(axes, eta, b.to_camera, b.seen)
     _turn_effect(light, camera, count, b, s, moved)
     return moved
 
@@ -545,12 +479,11 @@ def _choose_crossed(b: Lumitexel) -> None:
 
 @kernel
 def separate(
-    n: Vector,
+    surfel: int,
+    block: Block,
     turn: Vector,
     eta: float,
     table: Tensor32,
-    noise: Noise,
-    surfel: int,
     b: Lumitexel,
     s: Separation,
     estimate: Vector,
@@ -566,9 +499,7 @@ def separate(
     and not less than the last (Cameron, Gelbach and Miller 2011). Crossed samples alone
     are used if there are enough. Returns the mean factor of the surface part.
     """
-    estimate[:] = np.nan
-    error[:] = np.nan
-    total[:] = np.nan
+    n = block.normal[surfel]
     write_cosines(n, eta, MIN_COSINE_ALBEDO, b)
     if choose(b) < MIN_SAMPLES_GLOSS:  # grazing samples are better than none
         write_cosines(n, eta, MIN_COSINE_SURFACE, b)
@@ -576,7 +507,7 @@ def separate(
             return 1.0
     _choose_crossed(b)
     count = write_rows(n, table, b)
-    write_noise(surfel, count, noise, b)
+    write_noise(surfel, count, block.noise, b)
     for r in range(count):
         s.shape[r] = b.enters[b.pairs[r, 0]] * b.leaves[b.pairs[r, 1]]
         s.mean[r] = (b.sample[0, r] + b.sample[1, r] + b.sample[2, r]) / np.float32(3)
@@ -602,48 +533,29 @@ def separate(
 
 @kernel
 def separate_block(
-    sample: NDArray[Any],
-    position: Matrix,
-    light: Matrix,
-    camera: Matrix,
-    normal: Matrix,
+    block: Block,
     turn: Matrix,
     table: Tensor32,
-    noise: Noise,
-    polarisation: Matrix,
     eta: float,
     estimate: Matrix,
     error: Matrix,
     total: Matrix,
     gloss: Vector,
 ) -> None:
-    """`separate` of every surfel of a block."""
-    polarised = polarisation.shape[0] > 0
-    b = lumitexel_memory(light.shape[0], camera.shape[0], 2 * COLUMNS, polarised)
-    s = separation_memory(light.shape[0] * camera.shape[0])
-    for i in range(position.shape[0]):
-        unpack(sample[i], b.values)
-        if sample_status(b.values) == UNSEEN or not np.isfinite(normal[i]).all():
-            estimate[i] = np.nan
-            error[i] = np.nan
-            total[i] = np.nan
+    """`separate` of every surfel of a block; the results are NaN and 1 before."""
+    b = block_memory(block, 2 * COLUMNS)
+    s = separation_memory(b.pairs.shape[0])
+    for i in range(block.position.shape[0]):
+        unpack(block.sample[i], b.values)
+        known = np.isfinite(block.normal[i]).all()
+        if sample_status(b.values) == UNSEEN or not known:
             continue
         # squares of values far outside the range of reflectance would overflow
         power = scale_to_one(b.values) if largest_finite(b.values) > MAX_SAMPLE else 1.0
-        write_directions(position[i], light, camera, b)
-        write_gloss(polarisation, eta, b)
+        write_directions(block.position[i], block.light, block.camera, b)
+        write_gloss(block.polarisation, eta, b)
         gloss[i] = separate(
-            normal[i],
-            turn[i],
-            eta,
-            table,
-            noise,
-            i,
-            b,
-            s,
-            estimate[i],
-            error[i],
-            total[i],
+            i, block, turn[i], eta, table, b, s, estimate[i], error[i], total[i]
         )
         for c in range(3):
             estimate[i, c] /= power

@@ -6,8 +6,10 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from skindb.jit import fast_kernel, inline_fast_kernel
-from skindb.reflectance._row_kernels import Triple, _angles
+from skindb.reflectance._row_kernels import Triple, cells, interpolate
 from skindb.types import Cube, Matrix, Matrix32, Tensor32, Vector, Vector32
 
 
@@ -30,37 +32,21 @@ def circular_reversal(cosine: float, eta: float) -> float:
 
 @inline_fast_kernel
 def _surface(
-    table: Tensor32, weight: Vector32, n: Triple, wi: Triple, wo: Triple
+    table: Tensor32,
+    weight: Vector32,
+    n: Triple,
+    wi: Triple,
+    wo: Triple,
+    value: Vector32,
 ) -> float:
     """Sum over components of weight times the trilinear table value; n, wi, wo are unit
-    3-tuples.
+    3-tuples, and `value` is memory for the components.
     """
-    theta_h, theta_d, phi = _angles(n, wi, wo)
-    nh, nd, n_phi, size = table.shape
-    half = 0.5 * math.pi
-    x = math.sqrt(min(theta_h / half, 1.0)) * (nh - 1)
-    y = min(theta_d / half, 1.0) * (nd - 1)
-    z = phi / math.pi * n_phi
-    i = min(int(x), nh - 2)
-    j = min(int(y), nd - 2)
-    k = int(z)
-    fx = x - i
-    fy = y - j
-    fz = z - k
-    k = k % n_phi
-    k1 = k + 1 if k + 1 < n_phi else 0
+    x, y, z = cells(n, wi, wo, table.shape)
+    interpolate(table, x, y, z, 1.0, value)
     total = 0.0
-    for m in range(size):
-        if weight[m] != 0.0:
-            low = (1.0 - fy) * (
-                (1.0 - fz) * table[i, j, k, m] + fz * table[i, j, k1, m]
-            ) + fy * ((1.0 - fz) * table[i, j + 1, k, m] + fz * table[i, j + 1, k1, m])
-            high = (1.0 - fy) * (
-                (1.0 - fz) * table[i + 1, j, k, m] + fz * table[i + 1, j, k1, m]
-            ) + fy * (
-                (1.0 - fz) * table[i + 1, j + 1, k, m] + fz * table[i + 1, j + 1, k1, m]
-            )
-            total += weight[m] * ((1.0 - fx) * low + fx * high)
+    for m in range(value.shape[0]):
+        total += weight[m] * value[m]
     return total
 
 
@@ -104,6 +90,7 @@ def shade(
 ) -> None:
     """Fill `out` (n, 3) with the radiance per unit of the light's radiant intensity."""
     n, points = lit.shape
+    value = np.empty(table.shape[3], np.float32)
     for i in range(n):
         nx = float(normal[i, 0])
         ny = float(normal[i, 1])
@@ -134,7 +121,12 @@ def shade(
                 )
                 if with_surface:
                     gloss += received * _surface(
-                        table, weight[i], (nx, ny, nz), (dx, dy, dz), (vx, vy, vz)
+                        table,
+                        weight[i],
+                        (nx, ny, nz),
+                        (dx, dy, dz),
+                        (vx, vy, vz),
+                        value,
                     )
         for c in range(3):
             out[i, c] = (matte * diffuse[i, c] + gloss) / points

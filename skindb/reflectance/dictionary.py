@@ -53,9 +53,6 @@ SOURCES = (
 # above it
 MIN_COSINE_TABLE = 0.03
 INCIDENCE = np.radians(np.arange(0, 86, 5))
-# rings, spokes; twice as many points change the worst average of the 59 materials by
-# 0.6 %
-FINE = (24, 72)
 
 
 @dataclass(frozen=True)
@@ -400,10 +397,6 @@ def dictionary_quality(
         - energy_excess: largest albedo minus 1 (at least 0), before or after averaging
           over the disc.
         - reciprocity_error: difference of the fitted tables when both directions are exchanged.
-        - one_sided_error: difference of the averages over the disc around either
-          direction, whose mean is tabulated.
-        - disc_quadrature_error: error of the quadrature of `convolve_disc` against FINE.
-        - disc_table_error: error of the interpolated tables against FINE.
         - interpolation_error: error of the tables before averaging against their source.
         - hole_fraction: fraction of unmeasured nodes above the horizon.
     """
@@ -425,12 +418,7 @@ def dictionary_quality(
         "reciprocity_error": weighted_error(back, forward, wi, wo),
     }
     unknown = np.full(len(dictionary.names), np.nan)
-    disc = dict.fromkeys(
-        ("one_sided_error", "disc_quadrature_error", "disc_table_error"), unknown
-    )
-    if fitted is not dictionary:
-        disc = _disc_errors(dictionary, angular_radius, forward, wi, wo)
-    figures |= disc | {"interpolation_error": unknown, "hole_fraction": unknown}
+    figures |= {"interpolation_error": unknown, "hole_fraction": unknown}
     if dictionary.origins:
         figures["interpolation_error"] = np.array(
             [origin.resampling_error for origin in dictionary.origins]
@@ -446,28 +434,6 @@ def dictionary_quality(
             "hole_fraction": np.zeros(len(unknown)),
         }
     return figures
-
-
-def _disc_errors(
-    dictionary: Dictionary, angular_radius: float, values: Array, wi: Array, wo: Array
-) -> dict[str, Array]:
-    """Errors of averaging over the disc; `values` are those of the tables
-    from `convolve_disc`.
-    """
-    pairs = (wi, wo), (wo, wi)
-    averages = np.mean(
-        [average_disc(dictionary, *pair, angular_radius) for pair in pairs], axis=0
-    )
-    forward, backward = (
-        average_disc(dictionary, *pair, angular_radius, far=FINE, near=FINE)
-        for pair in pairs
-    )
-    mean = (forward + backward) / 2
-    return {
-        "one_sided_error": weighted_error(mean + forward - backward, mean, wi, wo),
-        "disc_quadrature_error": weighted_error(averages, mean, wi, wo),
-        "disc_table_error": weighted_error(values, mean, wi, wo),
-    }
 
 
 def dictionary_report(

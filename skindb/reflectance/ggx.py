@@ -51,11 +51,12 @@ from skindb.reflectance.sampling import (
     MIN_COSINE_HALF,
     by_half_vector,
     half_vectors,
+    tangents,
 )
 from skindb.reflectance.tables import Table, tabulate
 from skindb.schema import FitStatus, check, dataset, variables
 from skindb.schema.notes import Omission
-from skindb.types import Array, Float32, dots, float64
+from skindb.types import Array, Float32, dots, float64, lengths
 
 ALBEDO_NODES = 24  # roughnesses at which the reflectance of a lobe is integrated
 # tables that stand for all lobes of a take, between which weights are interpolated; with a
@@ -210,20 +211,22 @@ class GGX:
     def shade(self, points: Points, lamp: Lamp, *, eta: float) -> Float32:
         """Radiance (n, 3) per radiant intensity [sr^-1 mm^-2], see `ReflectanceModel`."""
         out = shade_diffuse(points, lamp, eta=eta)
-        if points.parameters.shape[1] > 0:
-            _ggx_kernels.shade_ggx(
-                np.ascontiguousarray(points.position, np.float64),
-                np.ascontiguousarray(points.normal, np.float64),
-                np.ascontiguousarray(points.view, np.float64),
-                np.ascontiguousarray(points.parameters, np.float64),
-                np.ascontiguousarray(lamp.place, np.float64),
-                np.ascontiguousarray(lamp.lit, np.float32),
-                np.ascontiguousarray(lamp.axis, np.float64),
-                float(lamp.falloff),
-                float(self.index),
-                out,
-            )
-        return out
+        if points.parameters.shape[1] == 0:
+            return out
+        way = lamp.place - points.position[:, None]
+        distance = lengths(way)
+        towards = way / distance[..., None]
+        axes = np.stack([*tangents(points.normal), points.normal], axis=1)
+        wi = np.einsum("nak,npk->npa", axes, towards)
+        wo = np.einsum("nak,nk->na", axes, points.view)[:, None]
+        strength = points.parameters[:, [STRENGTH]]
+        roughness = points.parameters[:, [ROUGHNESS]]
+        value = evaluate_lobe(wi, wo, np.maximum(roughness, MIN_ROUGHNESS), self.index)
+        fall_off = np.maximum(-(towards @ lamp.axis), 0.0) ** lamp.falloff
+        received = lamp.lit * np.maximum(wi[..., 2], 0.0) * fall_off / distance**2
+        gloss = (strength * received * value).mean(axis=1)
+        gloss = np.where((wo[:, 0, 2] > 0) & (strength[:, 0] > 0), gloss, 0.0)
+        return np.asarray(out + gloss[:, None], np.float32)
 
     def normal_reflectance(self, parameters: Array) -> Array:
         """Fraction (n,) of light along the normal that the lobes reflect."""

@@ -202,14 +202,12 @@ class Mixture:
         if space >= count:
             return ()
         rank = space - self.dictionary.exact
-        bound = rank_truncation(self.dictionary, rank)
         omission = Omission(
             "dimensions of the dictionary",
             count - space,
             count,
-            f"rank {rank}; at a single pair of directions up to {bound.worst:.3g} "
-            "times the value",
-            bound.rms,
+            f"rank {rank}",
+            rank_truncation(self.dictionary, rank),
             "mixtures, RMS over directions,",
         )
         return (omission,)

@@ -37,10 +37,9 @@ from skindb.reflectance.tables import (
     stored_brdf,
 )
 from skindb.schema import FitStatus, check, dataset
-from skindb.types import AnyArray, Array, Index, Mask, dots, finite_rows, float64
+from skindb.types import AnyArray, Array, Index, dots, finite_rows, float64
 
 FRANK_WOLFE_STEPS = 200  # each step gives a valid bound; 500 steps lower it by 1 %
-MIN_COSINE_SAMPLES = 0.1  # cosine to light and camera above which fits use samples
 MAX_SAMPLED_SURFELS = 5000  # surfels, as in the paper's basis of one person
 SEEDS = 3
 PART = 65536  # surfels
@@ -147,18 +146,10 @@ def reduced_dictionary(dictionary: Dictionary, rank: int) -> tuple[Table, Array]
     return cached["reduced"], cached["lift"]
 
 
-@dataclass(frozen=True)
-class Truncation:
-    """Bounds on the error of any non-negative mixture, relative to the mixture."""
-
-    # over pairs of directions, in cube-root space (the metric of `brdf_metric`)
-    rms: float
-    # at the worst pair of directions; attained by a mixture of a single table
-    worst: float
-
-
-def truncation_bound(table: Table, reduced: Table, lift: Array) -> Truncation:
-    """Bound the error of mixtures sum_j x_j b_j, x >= 0, that are formed from reduced tables.
+def truncation_bound(table: Table, reduced: Table, lift: Array) -> float:
+    """Bound of the RMS error of any mixture sum_j x_j b_j, x >= 0, that is formed from reduced
+    tables, relative to the mixture: over pairs of directions, in cube-root space (the
+    metric of `brdf_metric`).
 
     Parameters
     ----------
@@ -170,70 +161,29 @@ def truncation_bound(table: Table, reduced: Table, lift: Array) -> Truncation:
     Notes
     -----
     Let e_j = b_j - (reduced lift)_j. The ratio of two sums over j is at most the
-    largest ratio of their terms. At a pair of directions, |sum x_j e_j| / sum x_j b_j
-    <= max_j |e_j| / b_j, and interpolation preserves this, being a mean with
-    non-negative weights. In a norm, |sum x_j b_j| >= sum x_j <u, b_j> for every unit
-    vector u, so the ratio is at most max_j |e_j| / <u, b_j>. The best u points to the
-    point nearest to 0 of the simplex of all b_j / |e_j|, which the method of Frank and
-    Wolfe approaches; every step gives a bound. The residual |M x - R| of a fit at its
-    minimum then changes by at most worst (|M x| + |M x'|), where x is found with the
-    tables and x' with the reduced ones.
+    largest ratio of their terms. As |sum x_j b_j| >= sum x_j <u, b_j> for every unit
+    vector u, |sum x_j e_j| / |sum x_j b_j| is at most max_j |e_j| / <u, b_j>. The best u
+    points to the point nearest to 0 of the simplex of all b_j / |e_j|, which the method
+    of Frank and Wolfe approaches; every step gives a bound.
     """
     error = (table - reduced @ lift).astype(np.float32)
     if not error.any():
-        return Truncation(0.0, 0.0)
-    above = nodes_above(TableGrid(*table.shape[:3]), MIN_COSINE_SAMPLES)
-    value = table[above]
-    off = np.abs(error[above])
-    ratio = np.divide(
-        off,
-        value,
-        out=np.where(off > 0, np.inf, 0.0).astype(off.dtype),
-        where=value > 0,
-    )
+        return 0.0
     length = np.sqrt(np.diag(brdf_metric(error, weighted_like=table)))
-    return Truncation(
-        _largest_ratio(brdf_metric(table), length), float(ratio.max(initial=0.0))
-    )
+    return _largest_ratio(brdf_metric(table), length)
 
 
 @lru_cache(maxsize=4)
-def rank_truncation(dictionary: Dictionary, rank: int) -> Truncation:
+def rank_truncation(dictionary: Dictionary, rank: int) -> float:
     """`truncation_bound` of `reduced_dictionary`; cached for the takes of a dome."""
 
     def make() -> dict[str, AnyArray]:
         reduced = reduced_dictionary(dictionary, rank)
-        bound = truncation_bound(dictionary.table, *reduced)
-        return {"rms": np.array(bound.rms), "worst": np.array(bound.worst)}
+        return {"bound": np.array(truncation_bound(dictionary.table, *reduced))}
 
-    cached = cached_arrays(
-        "truncation", (dictionary.digest, rank), sources=SOURCES, make=make
-    )
-    return Truncation(float(cached["rms"]), float(cached["worst"]))
-
-
-def nodes_above(grid: TableGrid, elevation: float) -> Mask:
-    """(nh, nd, np) nodes of all cells that contain a pair of directions whose cosines
-    both exceed `elevation`.
-
-    The smaller cosine is cos(theta_h) cos(theta_d) - sin(theta_h) sin(theta_d)
-    |cos(phi_d)|. It decreases with theta_h, theta_d and |cos(phi_d)|, so it is largest
-    in a corner of a cell, or where phi_d is pi/2.
-    """
-    slope = np.abs(np.cos(np.append(grid.phi_d, np.pi)))
-    lean = np.minimum(slope[:-1], slope[1:])
-    lean[(grid.phi_d < np.pi / 2) & (grid.phi_d + np.pi / grid.n_phi_d > np.pi / 2)] = (
-        0.0
-    )
-    h = grid.theta_h[:-1, None, None]
-    d = grid.theta_d[None, :-1, None]
-    cells = np.cos(h) * np.cos(d) - np.sin(h) * np.sin(d) * lean > elevation
-    nodes = np.zeros((grid.n_theta_h, grid.n_theta_d, grid.n_phi_d), np.bool_)
-    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        nodes[i : i + cells.shape[0], j : j + cells.shape[1]] |= cells | np.roll(
-            cells, 1, axis=2
-        )
-    return nodes
+    arguments = (dictionary.digest, rank)
+    cached = cached_arrays("truncation", arguments, sources=SOURCES, make=make)
+    return float(cached["bound"])
 
 
 def _largest_ratio(gram: Array, length: Array) -> float:

@@ -13,8 +13,8 @@ from functools import cache
 
 import numpy as np
 
-from skindb.jit import sample_bits
 from skindb.reflectance._separation_kernels import separate_block
+from skindb.reflectance.block import kernel_block
 from skindb.reflectance.dictionary import abc_parameters, evaluate_abc
 from skindb.reflectance.model import Block
 from skindb.reflectance.tables import DEFAULT_GRID, TableGrid, tabulate
@@ -59,31 +59,13 @@ def separate_diffuse(
         were used, 1 without polarisers: where there are enough, those behind crossed ones.
     """
     n = len(block.position)
-    reflectance = np.empty((n, 3))
-    error = np.empty((n, 3))
-    shared = np.empty((n, 3))
+    value, error, shared = np.full((3, n, 3), np.nan)
     gloss = np.ones(n)
-    position, light, camera, normal = (
-        np.ascontiguousarray(places, np.float64)
-        for places in (block.position, block.light, block.camera, block.normal)
-    )
+    table = _lobe_table()
     separate_block(
-        sample_bits(block.sample),
-        position,
-        light,
-        camera,
-        normal,
-        turns,
-        _lobe_table(),
-        block.noise,
-        np.ascontiguousarray(block.polarisation, np.float64),
-        float(eta),
-        reflectance,
-        error,
-        shared,
-        gloss,
+        kernel_block(block), turns, table, float(eta), value, error, shared, gloss
     )
-    return reflectance, error, shared, gloss
+    return value, error, shared, gloss
 
 
 @cache

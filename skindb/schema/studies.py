@@ -66,18 +66,6 @@ RECIPROCITY_ERROR = declare(
     "float64 dictionary_report/reciprocity_error(dictionary) [1]",
     "relative RMS difference when both directions are exchanged",
 )
-ONE_SIDED_ERROR = declare(
-    "float64 dictionary_report/one_sided_error(dictionary) [1]",
-    "relative RMS difference between disc averages around either direction",
-)
-DISC_QUADRATURE_ERROR = declare(
-    "float64 dictionary_report/disc_quadrature_error(dictionary) [1]",
-    "relative RMS error of the quadrature over the light's disc",
-)
-DISC_TABLE_ERROR = declare(
-    "float64 dictionary_report/disc_table_error(dictionary) [1]",
-    "relative RMS error of the averaged tables between their nodes",
-)
 INTERPOLATION_ERROR = declare(
     "float64 dictionary_report/interpolation_error(dictionary) [1]",
     "relative RMS error of the tables against their source",

@@ -9,21 +9,17 @@ from three_surfels import MATTE, SCALES, surfels, unit
 
 from skindb.errors import InputError
 from skindb.fit import estimate_normals, lumitexels
-from skindb.fit.normals import METHODS, surfel_normals
+from skindb.fit.normals import surfel_normals
 
 
 def _angles(found, true):
     return np.degrees(np.arccos(np.clip(np.einsum("nk,nk->n", found, true), -1, 1)))
 
 
-@pytest.mark.parametrize(
-    ("method", "limit"),
+def test_estimate_normals__recovers_truth(skin):
+    found = estimate_normals(skin.lumitexels)
     # degrees; 60 lights are 13 apart
-    [("combined", 0.3), ("chromatic", 0.3), ("photometric", 0.6)],
-)
-def test_estimate_normals__recovers_truth(skin, method, limit):
-    found = estimate_normals(skin.lumitexels, method=method)
-    assert np.median(_angles(found["shading_normal"].values, skin.normal)) < limit
+    assert np.median(_angles(found["shading_normal"].values, skin.normal)) < 0.3
     np.testing.assert_allclose(
         np.linalg.norm(found["shading_normal"], axis=1), 1, atol=1e-6
     )
@@ -55,11 +51,19 @@ def test_estimate_normals__colour_below_the_noise_is_ignored(new_skin):
     """Under 12 lights and one camera, without a scan."""
     grey = new_skin(grey=True, noise=0.04, gloss=0.0, lights=60)
     part = grey.lumitexels.isel(light=slice(0, 36, 3), camera=[0])
-    means = []
-    for method in ("photometric", "combined"):
-        found = estimate_normals(part, method=method, scan_error=60.0)
-        means.append(np.nanmean(_angles(found["shading_normal"].values, grey.normal)))
+    found = estimate_normals(part, scan_error=60.0)["shading_normal"].values
+    samples = part["reflectance_sample"].copy(data=_without_colour(part))
+    shaded = part.assign(reflectance_sample=samples)
+    alone = estimate_normals(shaded, scan_error=60.0)["shading_normal"].values
+    means = [np.nanmean(_angles(n, grey.normal)) for n in (alone, found)]
     assert means[1] < 1.02 * means[0]
+
+
+def _without_colour(part):
+    """The mean over the channels, of which the photometric estimate is alone."""
+    sample = part["reflectance_sample"].values
+    mean = sample.astype(np.float32).mean(axis=-1, keepdims=True)
+    return np.broadcast_to(mean, sample.shape).astype(sample.dtype)
 
 
 def test_estimate_normals__rotates_with_the_scene(skin):
@@ -89,13 +93,12 @@ def test_estimate_normals__does_not_depend_on_brightness(skin):
     np.testing.assert_allclose(once, twice, atol=2e-4)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_estimate_normals__unseen_surfel_is_nan_and_leaves_others_alone(skin, method):
+def test_estimate_normals__unseen_surfel_is_nan_and_leaves_others_alone(skin):
     sample = skin.lumitexels["reflectance_sample"].copy(deep=True)
     sample[3] = np.nan
     holed = skin.lumitexels.assign(reflectance_sample=sample)
-    whole = estimate_normals(skin.lumitexels, method=method)["shading_normal"].values
-    found = estimate_normals(holed, method=method)
+    whole = estimate_normals(skin.lumitexels)["shading_normal"].values
+    found = estimate_normals(holed)
     assert np.isnan(found["shading_normal"].values[3]).all()
     for name in ("normal_error", "normal_total_error"):
         assert np.isnan(found[name].values[3])
@@ -113,10 +116,9 @@ def test_estimate_normals__few_lights_lean_on_the_scan(skin):
     assert _angles(found[known], skin.normal[known]).max() < 15
 
 
-@pytest.mark.parametrize("method", ["combined", "photometric", "chromatic"])
-def test_estimate_normals__error_covers_noise_and_scan(new_skin, method):
+def test_estimate_normals__error_covers_noise_and_scan(new_skin):
     skin = new_skin(surfels=300, gloss=0.0, noise=0.03)
-    found = estimate_normals(skin.lumitexels, method=method)
+    found = estimate_normals(skin.lumitexels)
     angle = _angles(found["shading_normal"].values, skin.normal)
     error = found["normal_error"].values
     # two equal axes: 95 % below 1.73 of the RMS angle (chi-square of two degrees of
@@ -127,14 +129,10 @@ def test_estimate_normals__error_covers_noise_and_scan(new_skin, method):
     assert 0.88 < np.sqrt((angle**2).mean() / (error**2).mean()) < 1.12
     # half of this error would cover 53 %
     assert (angle < 1.73 / 2 * error).mean() < 0.75
-    if method == "combined":
-        assert (found["normal_total_error"].values > 3 * error).all()
-    else:
-        assert np.isnan(found["normal_total_error"].values).all()
+    assert (found["normal_total_error"].values > 3 * error).all()
 
 
-@pytest.mark.parametrize("method", ["combined", "photometric", "chromatic"])
-def test_estimate_normals__error_has_the_size_of_the_noise(new_skin, method):
+def test_estimate_normals__error_has_the_size_of_the_noise(new_skin):
     """Rationale: matte skin, no prior: noise alone. Expected: RMS angle over RMS error
     1; 600 surfels give it to 2 %.
 
@@ -142,7 +140,7 @@ def test_estimate_normals__error_has_the_size_of_the_noise(new_skin, method):
     1.13 for the combined one.
     """
     skin = new_skin(surfels=600, gloss=0.0, noise=0.05)
-    found = estimate_normals(skin.lumitexels, method=method, scan_error=1e3)
+    found = estimate_normals(skin.lumitexels, scan_error=1e3)
     angle = _angles(found["shading_normal"].values, skin.normal)
     error = found["normal_error"].values
     assert abs(np.sqrt((angle**2).mean() / (error**2).mean()) - 1) < 0.06
@@ -172,11 +170,6 @@ def test_estimate_normals__any_chunking(skin, chunk):
     )
 
 
-def test_estimate_normals__unknown_method_is_refused(skin):
-    with pytest.raises(ValueError, match="method must be one of"):
-        estimate_normals(skin.lumitexels, method="guess")
-
-
 def test_lumitexels__names_every_missing_variable():
     import xarray as xr
 
@@ -188,13 +181,11 @@ def test_lumitexels__names_every_missing_variable():
 # extreme inputs
 
 
-def _normals(skin, method="combined", *, eta=1.3, scan=None):
+def _normals(skin, *, eta=1.3, scan=None):
     """Normals (3, 3) from a scan that is off by three degrees."""
     scan = _scan(skin) if scan is None else scan
     geometry = skin.position, skin.light, skin.camera, scan
-    return surfel_normals(
-        skin.sample, *geometry, method=method, eta=eta, scan_error=3.0
-    )[0]
+    return surfel_normals(skin.sample, *geometry, eta=eta, scan_error=3.0)[0]
 
 
 def _scan(skin):
@@ -202,26 +193,23 @@ def _scan(skin):
 
 
 @pytest.mark.parametrize("eta", [1.0, 1.3])
-@pytest.mark.parametrize("method", ["combined", "chromatic", "photometric"])
-def test_estimate_normals__2400_samples_of_matte_skin(method, eta):
+def test_estimate_normals__2400_samples_of_matte_skin(eta):
     skin = surfels(150, 16, eta=eta, weight=MATTE)
-    assert _angles(_normals(skin, method, eta=eta), skin.normal).max() < 0.5
+    assert _angles(_normals(skin, eta=eta), skin.normal).max() < 0.5
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_estimate_normals__black_and_saturated_surfels_leave_the_others_alone(method):
-    expected = _normals(surfels(), method)
+def test_estimate_normals__black_and_saturated_surfels_leave_the_others_alone():
+    expected = _normals(surfels())
     for value in (0.0, np.nan):
-        estimate = _normals(surfels().filled(value), method)
+        estimate = _normals(surfels().filled(value))
         assert np.isnan(estimate[0]).all()
         np.testing.assert_allclose(estimate[1:], expected[1:], atol=1e-7)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_estimate_normals__one_or_three_samples_give_nan_or_lie_near_the_scan(method):
+def test_estimate_normals__one_or_three_samples_give_nan_or_lie_near_the_scan():
     for lights in (1, 3):
         skin = surfels(lights, 1)
-        estimate = _normals(skin, method)
+        estimate = _normals(skin)
         finite = np.isfinite(estimate).all(axis=1)
         length = np.linalg.norm(estimate[finite], axis=1)
         np.testing.assert_allclose(length, 1.0, atol=1e-6)
@@ -230,33 +218,29 @@ def test_estimate_normals__one_or_three_samples_give_nan_or_lie_near_the_scan(me
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS)
-def test_estimate_normals__any_scale_of_the_samples(method):
+def test_estimate_normals__any_scale_of_the_samples():
     skin = surfels(weight=MATTE, dtype=np.float32)
-    expected = _normals(skin, method)
+    expected = _normals(skin)
     for scale in SCALES:
-        estimate = _normals(skin.scaled(scale), method)
+        estimate = _normals(skin.scaled(scale))
         np.testing.assert_allclose(estimate, expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("method", ["combined", "chromatic", "photometric"])
-def test_estimate_normals__one_broken_sample_changes_little(method):
+def test_estimate_normals__one_broken_sample_changes_little():
     skin = surfels(weight=MATTE)
     for value in (np.nan, np.inf):
-        assert _angles(_normals(skin.spoiled(value), method), skin.normal)[0] < 0.5
+        assert _angles(_normals(skin.spoiled(value)), skin.normal)[0] < 0.5
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_estimate_normals__constant_samples_give_unit_vectors_or_nan(method):
+def test_estimate_normals__constant_samples_give_unit_vectors_or_nan():
     skin = surfels().with_sample(np.s_[:], 0.2)
-    length = np.linalg.norm(_normals(skin, method), axis=1)
+    length = np.linalg.norm(_normals(skin), axis=1)
     assert (np.isnan(length) | (np.abs(length - 1) < 1e-6)).all()
 
 
-@pytest.mark.parametrize("method", ["combined", "chromatic", "photometric"])
-def test_estimate_normals__without_a_normal_of_the_scan_is_nan(method):
+def test_estimate_normals__without_a_normal_of_the_scan_is_nan():
     scan = np.full((3, 3), np.nan)
-    assert np.isnan(_normals(surfels(weight=MATTE), method, scan=scan)).all()
+    assert np.isnan(_normals(surfels(weight=MATTE), scan=scan)).all()
 
 
 def test_estimate_normals__no_surfels():

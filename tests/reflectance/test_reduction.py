@@ -6,17 +6,15 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from skindb.optics.angles import directions, half_difference
 from skindb.reflectance.dictionary import abc_parameters, evaluate_abc
 from skindb.reflectance.reduction import (
     Systems,
     factor_reflectance,
-    nodes_above,
     reduce_dictionary,
     residuals,
     truncation_bound,
 )
-from skindb.reflectance.tables import TableGrid, brdf_metric, lookup, tabulate
+from skindb.reflectance.tables import TableGrid, brdf_metric, tabulate
 
 GRID = TableGrid(24, 20, 8)
 # of a mixture: tables are single floats, mixed ones sums of terms up to a thousand
@@ -37,14 +35,6 @@ def _mixtures(rng, m):
     return np.concatenate([dense, sparse[sparse.any(axis=1)], np.eye(m)])
 
 
-def _pairs(rng, n, elevation):
-    """Directions with both cosines above the elevation, many of them just above it."""
-    cosine = elevation + (1 - elevation) * rng.random((2, n)) ** 3
-    turn = rng.uniform(0, 2 * np.pi, (2, n))
-    sine = np.sqrt(1 - cosine**2)
-    return np.stack([sine * np.cos(turn), sine * np.sin(turn), cosine], axis=-1)
-
-
 @pytest.mark.parametrize("rank", [3, 8, 16, 24])
 def test_truncation_bound__holds_for_mixtures(tables, rank):
     rng = np.random.default_rng(rank)
@@ -56,50 +46,14 @@ def test_truncation_bound__holds_for_mixtures(tables, rank):
     )
     signs = np.concatenate([0 * x, x], axis=1), np.concatenate([x, 0 * x], axis=1)
     off, whole = (np.sqrt(np.einsum("ij,jk,ik->i", s, metric, s)) for s in signs)
-    assert (off <= bound.rms * whole * (1 + SINGLE)).all()
+    assert (off <= bound * whole * (1 + SINGLE)).all()
     # a single table is a mixture: the bound is not far from the actual error
-    assert (off / whole).max() > 0.8 * bound.rms
-    angles = half_difference(*_pairs(rng, 4000, 0.1))
-    exact = lookup(tables, *angles) @ x.T
-    near = lookup(reduced, *angles) @ lift @ x.T
-    share = np.abs(near - exact) / exact
-    assert (share <= bound.worst + SINGLE).all()
-    wi, wo = directions(
-        *np.meshgrid(GRID.theta_h, GRID.theta_d, GRID.phi_d, indexing="ij")
-    )
-    node = np.minimum(wi[..., 2], wo[..., 2]) > 0.1
-    single = np.abs((reduced @ lift)[node] / tables[node] - 1)
-    # which covers the nodes below the elevation beside these, on a coarse grid
-    assert single.max() > 0.3 * bound.worst
+    assert (off / whole).max() > 0.8 * bound
 
 
 def test_truncation_bound__is_zero_at_full_rank(tables):
     bound = truncation_bound(tables, *reduce_dictionary(tables, tables.shape[-1]))
-    assert (bound.rms, bound.worst) == (0.0, 0.0)
-
-
-def test_truncation_bound__is_infinite_where_a_table_is_zero():
-    table = np.ones((24, 20, 8, 3), np.float32)
-    table[3, 4, 5, 1] = 0
-    assert truncation_bound(table, *reduce_dictionary(table, 1)).worst == np.inf
-
-
-@pytest.mark.parametrize("n_phi", [7, 8])
-def test_nodes_above__are_those_that_pairs_use(n_phi):
-    grid = TableGrid(24, 20, n_phi)
-    x, y, z = (
-        np.random.default_rng(1).random((3, 1_000_000))
-        * np.array([23, 19, n_phi])[:, None]
-    )
-    pairs = directions((x / 23) ** 2 * np.pi / 2, y / 19 * np.pi / 2, z / n_phi * np.pi)
-    above = np.min([w[:, 2] for w in pairs], axis=0) > 0.3
-    i, j, k = (a[above].astype(int) for a in (x, y, z))
-    used = np.zeros((24, 20, n_phi), bool)
-    for corner in np.ndindex(2, 2, 2):
-        used[i + corner[0], j + corner[1], (k + corner[2]) % n_phi] = True
-    found = nodes_above(grid, 0.3)
-    assert (found | ~used).all()
-    assert (found & ~used).mean() < 0.01  # a million pairs miss the smallest corners
+    assert bound == 0.0
 
 
 def _problem(rng, *, n=60, m=20, k=3, noise=0.0):
