@@ -54,13 +54,12 @@ RARE_CHI_SQUARED = 1e-6
 CLEAR = 0.05
 PER_FIBRE = ("distance", "face", "log_profile", "error")
 PROBE = (
+    "fibre_distance",
     "fibre_profile",
     "fibre_profile_error",
-    "fibre_distance",
     "gain_known",
     "fibre_radius",
 )
-PARAMETERS = {"site_best_exponent": (2,)}  # additional dimensions of variables
 SMOOTH = 10.0  # mm; within this distance of a site its value hardly changes
 MIDLINE = 10.0  # mm; sites farther from the mid-plane represent both sides of the face
 TRUSTED = (*IDENTIFIED, ProbeStatus.NOT_CONVERGED)
@@ -72,8 +71,6 @@ FIELDS = {
     "site_sigma_tr_error": "sigma_tr_error",
     "site_sigma_tr_model_error": "sigma_tr_model_error",
     "site_sigma_tr_total_error": "sigma_tr_total_error",
-    "site_correlation": "correlation",
-    "site_best_exponent": "combination",
     "site_gain": "gain",
     "site_residual": "residual",
     "site_misfit": "misfit",
@@ -103,9 +100,6 @@ class ProbeFit:
     # RMS of the relative residual of clear fibres that neither error explains
     misfit: float = math.nan
     chi_squared: float = math.nan  # for both errors, per degree of freedom
-    correlation: float = math.nan  # of log sigma_tr and log sigma_s'
-    # exponents (a, b): sigma_tr^a sigma_s'^b is what the profile determines best
-    combination: tuple[float, float] = (math.nan, math.nan)
 
 
 @dataclass(frozen=True)
@@ -353,8 +347,6 @@ def _report(minimum: Any, problem: Problem, *, rival: float, near: float) -> Pro
         misfit=unexplained,
         chi_squared=excess,
         used=fibres,
-        correlation=float(covariance[0, 1] / (sd[0] * sd[1])),
-        combination=_best_exponents(covariance),
         status=next(broken, ProbeStatus.FITTED),
     )
 
@@ -375,16 +367,6 @@ def _covariance(minimum: Any, problem: Problem, excess: float) -> tuple[Array, A
     ) + 1e-18 * np.eye(size)
     covariance += effect[:, fibres:] @ effect[:, fibres:].T
     return covariance, gain[0]
-
-
-def _best_exponents(covariance: Array) -> tuple[float, float]:
-    """Exponents (a, b) of the product sigma_tr^a sigma_s'^b that is determined best; the
-    larger is 1.
-    """
-    _, vectors = np.linalg.eigh(covariance[:2, :2])
-    sharp = vectors[:, 0] / np.abs(vectors[:, 0]).max()
-    sharp = sharp * np.sign(sharp[0]) if sharp[0] else sharp
-    return float(sharp[0]), float(sharp[1])
 
 
 def _at_bound(p: Array) -> bool:
@@ -428,8 +410,6 @@ def fit_probe(probe: xr.Dataset, *, eta: float = 1.3) -> xr.Dataset:
     Dataset
         `site_absorption`, `site_reduced_scattering`, `site_sigma_tr` with its errors
         due to the fibres, the model of the profile, and both (total) [mm^-1],
-        `site_correlation` of the errors of log sigma_tr and log sigma_s',
-        `site_best_exponent` of the product of both that is determined best,
         `site_gain`, `site_residual`, `site_misfit`, `site_chi_squared`,
         `site_fibres_used`, `site_status`; NaN where nothing was fitted.
 
@@ -450,34 +430,23 @@ def fit_probe(probe: xr.Dataset, *, eta: float = 1.3) -> xr.Dataset:
     check(probe, PROBE, where="probe")
     free = not bool(probe["gain_known"])
     radius = float(probe["fibre_radius"])
-    fits = _fit_each(probe, eta=eta, radius=radius, free_gain=free)
+    distance, value, error = (
+        probe[name].values.astype(np.float64) for name in PROBE[:3]
+    )
+    fits = [
+        fit_profile(distance, v, e, radius=radius, eta=eta, free_gain=free)
+        for site, errors in zip(value, error, strict=True)
+        for v, e in zip(site.T, errors.T, strict=True)
+    ]
     shape = probe.sizes["site"], probe.sizes["channel"]
     columns = {
-        name: np.asarray(
-            [[getattr(fit, field) for fit in row] for row in fits]
-        ).reshape(*shape, *PARAMETERS.get(name, ()))
+        name: np.reshape([getattr(fit, field) for fit in fits], shape)
         for name, field in FIELDS.items()
     }
     coords = {
         dim: probe[dim].values for dim in ("site", "channel") if dim in probe.coords
     }
-    return dataset(
-        columns,
-        coords=coords | {"parameter": ["sigma_tr", "sigma_s_prime"]},
-    )
-
-
-def _fit_each(probe: xr.Dataset, **options: Any) -> list[list[ProbeFit]]:
-    """One fit per site and channel."""
-    names = ("fibre_distance", "fibre_profile", "fibre_profile_error")
-    distance, value, error = (probe[name].values.astype(np.float64) for name in names)
-    return [
-        [
-            fit_profile(distance, v, e, **options)
-            for v, e in zip(site.T, errors.T, strict=True)
-        ]
-        for site, errors in zip(value, error, strict=True)
-    ]
+    return dataset(columns, coords=coords)
 
 
 def summarise_translucency(sites: xr.Dataset) -> dict[str, dict[str, list[Any]]]:
@@ -535,21 +504,14 @@ def tabulate_translucency(
         Site, channel, sigma_tr, its total error, the part of it that is noise [mm^-1],
         name of the status; NaN where nothing was fitted.
     """
-    sites = (
-        summarise_translucency(source)
-        if isinstance(source, xr.Dataset)
-        else source.get("translucency", {})
-    )
-    rows = [
-        [
-            site,
-            channel,
-            *(_or_nan(values[key][c]) for key in ("sigma_tr", "total_error", "error")),
-            values["status"][c],
-        ]
-        for site, values in sites.items()
-        for c, channel in enumerate("RGB")
-    ]
+    if isinstance(source, xr.Dataset):
+        source = {"translucency": summarise_translucency(source)}
+    rows = []
+    for site, values in source.get("translucency", {}).items():
+        for c, channel in enumerate("RGB"):
+            numbers = (values[key][c] for key in ("sigma_tr", "total_error", "error"))
+            cells = [math.nan if number is None else number for number in numbers]
+            rows.append([site, channel, *cells, values["status"][c]])
     return list(TABLE_HEADER), rows
 
 
@@ -558,10 +520,6 @@ def _number(value: float) -> float | None:
     JSON does not support.
     """
     return float(f"{value:.5g}") if np.isfinite(value) else None
-
-
-def _or_nan(value: float | None) -> float:
-    return float("nan") if value is None else value
 
 
 def translucency_map(surfels: xr.Dataset, sites: xr.Dataset) -> xr.Dataset:

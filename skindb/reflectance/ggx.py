@@ -46,17 +46,11 @@ from skindb.reflectance.model import (
     SurfaceFit,
 )
 from skindb.reflectance.reduction import fitted_surfels
-from skindb.reflectance.sampling import (
-    COSINE_FRACTION,
-    MIN_COSINE_HALF,
-    by_half_vector,
-    half_vectors,
-    tangents,
-)
+from skindb.reflectance.sampling import tangents
 from skindb.reflectance.tables import Table, tabulate
 from skindb.schema import FitStatus, check, dataset, variables
 from skindb.schema.notes import Omission
-from skindb.types import Array, Float32, dots, float64, lengths
+from skindb.types import Array, Float32, float64, lengths
 
 ALBEDO_NODES = 24  # roughnesses at which the reflectance of a lobe is integrated
 # tables that stand for all lobes of a take, between which weights are interpolated; with a
@@ -257,47 +251,6 @@ class GGX:
         distance = np.abs(place[:, None] - np.arange(len(nodes)))
         return tables, strength[:, None] * np.maximum(1 - distance, 0.0)
 
-    def sampler(self) -> LobeSampler:
-        """Sampler of directions by the distribution of the half vectors."""
-        return LobeSampler()
-
     def _albedo(self, roughness: Array) -> Array:
         nodes, albedo = _normal_albedo(self.index)
         return np.asarray(np.interp(roughness, nodes, albedo))
-
-
-@dataclass(frozen=True)
-class LobeSampler:
-    """Directions by GGX half vectors, and by the cosine alone for what they miss."""
-
-    def mix(self, parameters: Array) -> Array:
-        """(n, 2) probability of the lobe, and its roughness."""
-        if parameters.shape[1] == 0:  # without the surface term
-            return np.tile([0.0, MAX_ROUGHNESS], (len(parameters), 1))
-        shiny = parameters[:, STRENGTH] > 0
-        roughness = np.maximum(parameters[:, ROUGHNESS], MIN_ROUGHNESS)
-        return np.column_stack([(1 - COSINE_FRACTION) * shiny, roughness])
-
-    def sample(self, mix: Array, normal: Array, view: Array, draw: Array) -> Array:
-        """Directions (n, 3), see `DirectionSampler`."""
-        probability, roughness = mix.T
-        lobe = draw[:, 0] < probability
-        turn = 2 * np.pi * draw[:, 2]
-        square = roughness**2
-        # of the half vector (Walter et al. 2007, eq. 35), or of a direction by its cosine
-        half = 1 / (1 + square * draw[:, 1] / (1 - draw[:, 1]))
-        cosine = np.sqrt(np.where(lobe, half, 1 - draw[:, 1]))
-        return by_half_vector(normal, view, cosine, turn, lobe)
-
-    def pdf(self, mix: Array, normal: Array, view: Array, towards: Array) -> Array:
-        """Density (n,) per steradian of `sample`; 0 below the surface."""
-        probability, roughness = mix.T
-        cosine = dots(normal, towards)
-        half = half_vectors(view, towards)
-        cos_h = np.maximum(dots(half, normal), 0.0)
-        cos_d = dots(half, view)
-        square = roughness**2
-        spread = square / (np.pi * (cos_h**2 * (square - 1) + 1) ** 2)
-        lobe = spread * cos_h / (4 * np.maximum(cos_d, MIN_COSINE_HALF))
-        density = probability * lobe + (1 - probability) * cosine / np.pi
-        return np.asarray(np.where(cosine > 0, density, 0.0))

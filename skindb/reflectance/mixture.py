@@ -38,7 +38,6 @@ from skindb.reflectance.reduction import (
     reduce_basis,
     reduced_dictionary,
 )
-from skindb.reflectance.sampling import TableSampler
 from skindb.reflectance.tables import (
     Table,
     TableGrid,
@@ -327,10 +326,6 @@ class Mixture:
     def resample(self, parameters: Array) -> tuple[Table, Array]:
         """The tables and the weights as they are."""
         return self.table, parameters
-
-    def sampler(self) -> TableSampler:
-        """Sampler of directions by the half vectors of the tables."""
-        return TableSampler.of_tables(self.table)
 
 
 def basis_rows(

@@ -144,21 +144,6 @@ class FitRequest(NamedTuple):
     dictionary: Dictionary | None = None  # for point lights; default the embedded one
 
 
-class DirectionSampler(Protocol):
-    """Random directions towards the light, with their probability density."""
-
-    def mix(self, parameters: Array) -> Array:
-        """What `sample` and `pdf` need to know of points with these parameters (n, p)."""
-
-    def sample(self, mix: Array, normal: Array, view: Array, draw: Array) -> Array:
-        """Directions (n, 3) from uniform numbers `draw` (n, 4); those below the surface
-        carry no light.
-        """
-
-    def pdf(self, mix: Array, normal: Array, view: Array, towards: Array) -> Array:
-        """Density (n,) per steradian of the directions `towards` (n, 3)."""
-
-
 class ReflectanceModel(Protocol):
     """The reflection at the surface of a take: what all surfels share.
 
@@ -242,11 +227,9 @@ class ReflectanceModel(Protocol):
 
     def resample(self, parameters: Array) -> tuple[Table, Array]:
         """Tables (nh, nd, np, k) and weights (n, k) whose mixtures are the surface term,
-        for programs that read tables; the viewer shows at most `MAX_TABLES`.
+        for programs that read tables and for samplers of directions; the viewer shows at
+        most `MAX_TABLES`.
         """
-
-    def sampler(self) -> DirectionSampler:
-        """Sampler of directions in proportion to the surface term."""
 
 
 class SurfaceKind(Protocol):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from skindb.reflectance.tables import directional_albedo
-from skindb.types import Array, Float32, Mask, dots, float64, lengths, unit
+from skindb.types import Array, Float32, dots, float64, lengths, unit
 
 # fraction of directions drawn by the cosine alone, as tables have tails that do not
 # depend on the half vector
@@ -98,14 +98,22 @@ class TableSampler:
             within = rest / np.maximum(self.density[which, cell], 1e-300)
             u = (cell + np.clip(within, 0.0, 1.0)) / cells
             cosine[lobe] = np.cos(u**2 * np.pi / 2)
-        return by_half_vector(normal, view, cosine, turn, lobe)
+        sine = np.sqrt(np.maximum(1 - cosine**2, 0.0))
+        tangent, second = tangents(normal)
+        drawn = (
+            (sine * np.cos(turn))[:, None] * tangent
+            + (sine * np.sin(turn))[:, None] * second
+            + cosine[:, None] * normal
+        )
+        mirror = 2 * dots(view, drawn)[:, None] * drawn - view
+        return np.asarray(np.where(lobe[:, None], mirror, drawn))
 
     def pdf(self, mix: Array, normal: Array, view: Array, towards: Array) -> Array:
         """Density (n,) per steradian with which `sample` draws the directions `towards`
         (n, 3); 0 below the surface.
         """
         cosine = dots(normal, towards)
-        half = half_vectors(view, towards)
+        half = unit(towards + view)
         cos_h = np.clip(dots(half, normal), -1.0, 1.0)
         cos_d = dots(half, view)
         # from the sine, because an arc cosine is too inaccurate for narrow lobes
@@ -127,33 +135,6 @@ class TableSampler:
                 0.0,
             )
         )
-
-
-def by_half_vector(
-    normal: Array,
-    view: Array,
-    cosine: Array,
-    turn: Array,
-    mirrored: Mask,
-) -> Array:
-    """Directions (n, 3) at a cosine (n,) to the normal and an azimuth `turn` (n,); where
-    `mirrored`, the view mirrored at this direction instead.
-    """
-    sine = np.sqrt(np.maximum(1 - cosine**2, 0.0))
-    tangent, second = tangents(normal)
-    drawn = (
-        (sine * np.cos(turn))[:, None] * tangent
-        + (sine * np.sin(turn))[:, None] * second
-        + cosine[:, None] * normal
-    )
-    mirror = 2 * dots(view, drawn)[:, None] * drawn - view
-    return np.asarray(np.where(mirrored[:, None], mirror, drawn))
-
-
-def half_vectors(view: Array, towards: Array) -> Array:
-    """Unit vectors (n, 3) half way between two directions."""
-    half = towards + view
-    return unit(half)
 
 
 def tangents(normal: Array) -> tuple[Array, Array]:

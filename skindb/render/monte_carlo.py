@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from skindb.geometry.rays import RayScene
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.reflectance.model import DirectionSampler, Lamp, Points
-from skindb.reflectance.sampling import tangents
+from skindb.reflectance.model import Lamp, Points
+from skindb.reflectance.sampling import TableSampler, tangents
 from skindb.render.scene import Camera, Environment, Lights, Surface
 from skindb.render.shading import (
     View,
@@ -197,7 +197,8 @@ class _Painter:
     scene: RayScene
     lighting: Lighting
     quality: Quality
-    lobes: DirectionSampler
+    lobes: TableSampler
+    weights: Array  # (v, k) of the lobes
     choice: LightChoice | None  # None without lights
     # (v, 3) `bounced_exitance` by the lights, from their centres: shadows of discs do not
     # matter for it
@@ -216,8 +217,9 @@ class _Painter:
         if lights is not None and surface.inter_reflection:
             received = transmitted_irradiance(surface, lights, scene)
             bounced = bounced_exitance(surface, received @ lights.intensity)
-        lobes = surface.model.sampler()
-        return cls(surface, scene, lighting, quality, lobes, choice, bounced)
+        tables, weights = surface.model.resample(surface.parameters)
+        lobes = TableSampler.of_tables(tables)
+        return cls(surface, scene, lighting, quality, lobes, weights, choice, bounced)
 
     def batch(self, view: View, rng: np.random.Generator) -> Image:
         """One independent estimate of the picture (h, w, 3)."""
@@ -290,7 +292,10 @@ class _Painter:
         """
         view = hits.view
         values = np.zeros((len(view.pixel), 3))
-        mix = self.lobes.mix(hits.points.parameters)
+        weights = hits.points.parameters
+        if weights.shape[1] > 0:
+            weights = view.interpolate(self.weights)
+        mix = self.lobes.mix(weights)
         lobe = np.concatenate(
             [stratified(view, rng)[:, :1], stratified(view, rng)], axis=1
         )

@@ -319,14 +319,6 @@ SITE_SIGMA_TR_TOTAL_ERROR = declare(
     "standard error of sigma_tr: errors of the fibres and of the model in quadrature",
     uses=Use.SAMPLED,
 )
-SITE_CORRELATION = declare(
-    "float32 translucency/site_correlation(site, channel) [1]",
-    "correlation of the errors of log sigma_tr, log sigma_s'",
-)
-SITE_BEST_EXPONENT = declare(
-    "float32 translucency/site_best_exponent(site, channel, parameter) [1]",
-    "exponents a, b of sigma_tr^a sigma_s'^b, the product that the profile determines best",
-)
 SITE_GAIN = declare(
     "float32 translucency/site_gain(site, channel) [1]",
     "gain of the probe found by the fit; 1 where it is known",

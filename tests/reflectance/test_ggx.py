@@ -23,6 +23,7 @@ from skindb.reflectance.model import (
     Lamp,
     Points,
 )
+from skindb.reflectance.sampling import TableSampler
 from skindb.schema import FitStatus, dataset
 
 INDEX = 1.4
@@ -309,13 +310,14 @@ def test_resample__tables_reproduce_the_lobes():
     assert np.sqrt(np.mean((near - exact) ** 2) / np.mean(exact**2)) < 0.03
 
 
-def test_sampler__density_integrates_to_one_and_weights_have_the_albedo_as_mean():
+def test_resample__directions_by_its_tables_have_the_albedo_as_mean():
     rng = np.random.default_rng(0)
-    sampler = GGX(INDEX).sampler()
     n = 200_000
+    tables, weights = GGX(INDEX).resample(np.tile([1.0, 0.3], (n, 1)))
+    sampler = TableSampler.of_tables(tables)
     view = np.tile(unit(np.array([0.5, 0.1, 0.8])), (n, 1))
     normal = np.tile([0.0, 0.0, 1.0], (n, 1))
-    mix = sampler.mix(np.tile([1.0, 0.3], (n, 1)))
+    mix = sampler.mix(weights)
     towards = sampler.sample(mix, normal, view, rng.random((n, 3)))
     density = sampler.pdf(mix, normal, view, towards)
     up = towards[:, 2] > 0
@@ -329,7 +331,7 @@ def test_sampler__density_integrates_to_one_and_weights_have_the_albedo_as_mean(
     error = np.sqrt(((estimate**2).sum() / n - mean**2) / n)
     assert abs(mean - whole) < 5 * error
     flat = sampler.pdf(
-        np.tile([0.7, 0.3], (wi[..., 0].size, 1)),
+        np.tile(mix[:1], (wi[..., 0].size, 1)),
         np.tile([0.0, 0, 1], (wi[..., 0].size, 1)),
         np.tile(view[0], (wi[..., 0].size, 1)),
         wi.reshape(-1, 3),
