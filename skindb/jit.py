@@ -20,7 +20,7 @@ from numba.extending import intrinsic, overload
 from numpy.typing import NDArray
 
 from skindb.kernel_compiler import Kernel
-from skindb.types import IntVector32, Matrix32, Vector32
+from skindb.types import IntVector32, Matrix32, Vector, Vector32
 
 # a kernel keeps its signature for mypy, which checks its callers
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -299,6 +299,15 @@ def unpack(sample: NDArray[Any], out: Vector32) -> None:
     flat = sample.reshape(-1)
     for i in range(flat.shape[0]):
         out[i] = single(flat[i])
+
+
+@kernel
+def all_finite(values: Vector) -> bool:
+    """Whether no value is NaN or infinite; the same by NumPy takes a second to compile."""
+    finite = True
+    for i in range(values.shape[0]):
+        finite = finite and abs(values[i]) < np.inf
+    return finite
 
 
 @fast_kernel

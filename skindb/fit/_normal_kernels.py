@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.jit import kernel
+from skindb.jit import all_finite, kernel
 from skindb.optics._photometric_kernels import (
     NormalEstimates,
     buffers,
@@ -161,7 +161,7 @@ def normals_block(
         share = _combine(estimates, scan_error, chosen[s])
         error[s] = math.nan
         total[s] = math.nan
-        if np.isfinite(chosen[s]).all():
+        if all_finite(chosen[s]):
             error[s] = math.degrees(math.sqrt(_variance(share, estimates, scan_error)))
             if error[s] > MAX_ERROR_DEGREES:
                 chosen[s] = math.nan

@@ -15,14 +15,16 @@ from skindb.jit import is_stored
 from skindb.reflectance._block_kernels import fit_block
 from skindb.reflectance._ggx_kernels import fit_ggx
 from skindb.reflectance._joint_kernels import fit_jointly
+from skindb.reflectance.dictionary import embedded_dictionary
 from skindb.reflectance.ggx import GGX
 from skindb.reflectance.joint import refine_block
 from skindb.reflectance.mixture import Mixture
-from skindb.reflectance.model import Block, Comparison, FitRequest
+from skindb.reflectance.model import Block, Comparison
 from skindb.reflectance.separation import separate_diffuse
 from skindb.types import Progress, silent
 
-STEPS = ("mixture", "joint", "diffuse", "normals", "ggx")  # the longest first
+# in the order in which they are shared among processes, for similar times of two
+STEPS = ("mixture", "joint", "normals", "diffuse", "ggx")
 
 
 def compile_kernels(progress: Progress = silent) -> None:
@@ -32,20 +34,25 @@ def compile_kernels(progress: Progress = silent) -> None:
     kernels = (fit_jointly, fit_block, fit_ggx)
     if all(is_stored(kernel) for kernel in kernels):
         return
-    progress(COMPILING, 0, len(STEPS))
-    with ThreadPoolExecutor(thread_count()) as pool:
-        calls = [pool.submit(_compile_apart, step) for step in STEPS]
+    # each starts in two seconds, and compiles once what several of its steps use
+    count = min(thread_count(), len(STEPS))
+    progress(COMPILING, 0, count)
+    with ThreadPoolExecutor(count) as pool:
+        calls = [pool.submit(_compile_apart, STEPS[i::count]) for i in range(count)]
         try:
             for done, call in enumerate(as_completed(calls), 1):
                 call.result()
-                progress(COMPILING, done, len(STEPS))
+                progress(COMPILING, done, count)
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _compile_apart(step: str) -> None:
+def _compile_apart(steps: tuple[str, ...]) -> None:
     # what the compiler makes are millions of objects that stay
-    call = f"import gc; gc.disable(); from {__name__} import compile_step; compile_step({step!r})"
+    call = (
+        f"import gc; gc.disable(); from {__name__} import compile_step; "
+        f"[compile_step(step) for step in {steps!r}]"
+    )
     # what fails here fails in the fit too, which reports it
     subprocess.run([sys.executable, "-c", call], check=False, capture_output=True)
 
@@ -62,9 +69,9 @@ def compile_step(step: str) -> None:
             refine_block(block, comparison, scan_normal=none, scan_error=1.0)
         case "diffuse":
             separate_diffuse(block, np.zeros((0, 2)), eta=1.3)
-        case "mixture" | "ggx":
-            kind = Mixture if step == "mixture" else GGX
-            model = kind.unfitted(FitRequest(1.3, 0.0, 16, 4))
-            model.fit(block, comparison)
+        case "mixture":
+            Mixture(embedded_dictionary().table).fit(block, comparison)
+        case "ggx":
+            GGX().fit(block, comparison)
         case "normals":
             surfel_normals(*block[:4], none, eta=1.3, scan_error=3.0)

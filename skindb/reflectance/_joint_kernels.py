@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skindb.jit import LANES, fast_kernel, inline_fast_kernel, kernel, unpack
+from skindb.jit import LANES, fast_kernel, inline_fast_kernel, kernel
 from skindb.numerics._nnls_kernels import (
     ActiveSetMemory,
     active_set_memory,
@@ -22,8 +22,6 @@ from skindb.numerics._nnls_kernels import (
 )
 from skindb.reflectance._lumitexel_kernels import (
     FITTED,
-    MIN_COSINE_SURFACE,
-    MIN_SAMPLES_LAMBERT,
     MIN_SAMPLES_LOBES,
     MODEL_ERROR,
     OUTLIER_SPREAD,
@@ -31,18 +29,15 @@ from skindb.reflectance._lumitexel_kernels import (
     Options,
     RootMemory,
     block_memory,
-    choose,
     lobe_angles,
+    prepare,
     root_memory,
-    sample_status,
     slopes,
     smallest_half_angle,
     split_diffuse,
     weigh,
     weigh_outliers,
     write_cosines,
-    write_directions,
-    write_gloss,
     write_samples,
 )
 from skindb.reflectance._mixture_kernels import gram
@@ -58,7 +53,8 @@ LOBE = 5
 SAMPLE = LOBE + LOBES
 WIDTH = SAMPLE + 3
 PARAMETERS = 3 + LOBES  # R_d and the strengths of the lobes
-UNKNOWNS = PARAMETERS + 2  # and two angles of the normal
+TURN = PARAMETERS  # the first of two angles of the normal
+UNKNOWNS = PARAMETERS + 2
 FEW_UNKNOWNS = 6  # R_d, the factor of the shared lobe and the normal
 MAX_STEP = 0.15  # rad
 DIFFERENCE = 1e-3  # rad, for derivatives by the normal
@@ -117,14 +113,13 @@ class JointMemory(NamedTuple):
     strength: Vector  # (LOBES,) of the lobes
     target: Vector  # (PARAMETERS,) right side
     gram: Matrix  # (PARAMETERS, PARAMETERS)
-    cross: Matrix  # (PARAMETERS, 2) of the parameters and the normal
-    turn: Matrix  # (2, 2) of the normal
-    pull: Vector  # (2,) right side of the normal
+    turn: Matrix  # (2, 2) inverse of the equations of the normal
     step: Vector  # (2,) rad
     normal: Vector  # (3,)
     turned: Vector  # (3,)
     axes: Matrix  # (2, 3) tangents
-    equations: Matrix  # (UNKNOWNS, UNKNOWNS) of the active parameters and the normal
+    equations: Matrix  # (UNKNOWNS, UNKNOWNS) of the parameters and the normal
+    right: Vector  # (UNKNOWNS,)
     cholesky: Matrix  # (UNKNOWNS, UNKNOWNS)
     inverse: Matrix  # (UNKNOWNS, UNKNOWNS)
     score: Vector  # (UNKNOWNS,)
@@ -157,14 +152,13 @@ def joint_memory(lights: int, cameras: int) -> JointMemory:
         np.zeros(LOBES),
         np.empty(PARAMETERS),
         np.empty((PARAMETERS, PARAMETERS)),
-        np.empty((PARAMETERS, 2)),
         np.empty((2, 2)),
-        np.empty(2),
         np.empty(2),
         np.empty(3),
         np.empty(3),
         np.empty((2, 3)),
         square[0],
+        np.empty(UNKNOWNS),
         square[1],
         square[2],
         np.empty(UNKNOWNS),
@@ -334,57 +328,59 @@ def _write_equations(
     Gram matrix of the table, with the prior of the shared lobe.
     """
     M = m.moments
-    total = m.x[0] + m.x[1] + m.x[2]
-    squares = m.x[0] ** 2 + m.x[1] ** 2 + m.x[2] ** 2
-    m.gram[:] = 0.0
-    m.target[:] = 0.0
-    m.cross[:] = 0.0
-    m.pull[:] = 0.0
+    G = m.equations
+    right = m.right
+    G[:] = 0.0
+    right[:] = 0.0
     for c in range(3):
-        m.gram[c, c] = M[DIFFUSE, DIFFUSE]
-        m.target[c] = M[DIFFUSE, SAMPLE + c]
-        for j in range(wide):
-            m.gram[c, 3 + j] = M[DIFFUSE, LOBE + j]
-            m.gram[3 + j, c] = M[DIFFUSE, LOBE + j]
-            m.target[3 + j] += M[LOBE + j, SAMPLE + c]
+        d = m.x[c]
+        G[c, c] = M[DIFFUSE, DIFFUSE]
+        right[c] = M[DIFFUSE, SAMPLE + c]
+        for i in range(wide):
+            G[c, 3 + i] = M[DIFFUSE, LOBE + i]
+            right[3 + i] += M[LOBE + i, SAMPLE + c]
+            for j in range(wide):
+                G[3 + i, 3 + j] += M[LOBE + i, LOBE + j]
         for k in range(2):
-            m.cross[c, k] = m.x[c] * M[DIFFUSE, TURNED + k] + M[DIFFUSE, SURFACE + k]
-            m.pull[k] += m.x[c] * M[TURNED + k, SAMPLE + c] + M[SURFACE + k, SAMPLE + c]
-    for i in range(wide):
-        for j in range(wide):
-            m.gram[3 + i, 3 + j] = 3.0 * M[LOBE + i, LOBE + j]
-        for k in range(2):
-            shape = total * M[LOBE + i, TURNED + k]
-            m.cross[3 + i, k] = shape + 3.0 * M[LOBE + i, SURFACE + k]
-    for k in range(2):
-        for q in range(2):
-            mixed = M[TURNED + k, SURFACE + q] + M[SURFACE + k, TURNED + q]
-            m.turn[k, q] = squares * M[TURNED + k, TURNED + q] + total * mixed
-            m.turn[k, q] += 3.0 * M[SURFACE + k, SURFACE + q]
+            turned = TURNED + k
+            surface = SURFACE + k
+            G[c, TURN + k] = d * M[DIFFUSE, turned] + M[DIFFUSE, surface]
+            right[TURN + k] += d * M[turned, SAMPLE + c] + M[surface, SAMPLE + c]
+            for i in range(wide):
+                G[3 + i, TURN + k] += d * M[LOBE + i, turned] + M[LOBE + i, surface]
+            for q in range(2):
+                mixed = M[turned, SURFACE + q] + M[surface, TURNED + q]
+                both = d * d * M[turned, TURNED + q] + d * mixed
+                G[TURN + k, TURN + q] += both + M[surface, SURFACE + q]
     if wide > 0:
         precision = _least_variance(count, b, m) / lobes.gloss_spread**2
-        m.gram[3, 3] += precision
-        m.target[3] += precision * lobes.gloss
+        G[3, 3] += precision
+        right[3] += precision * lobes.gloss
+    for i in range(PARAMETERS):
+        m.target[i] = right[i]
+        for j in range(UNKNOWNS):
+            G[max(i, j), min(i, j)] = G[min(i, j), max(i, j)]
+        for j in range(PARAMETERS):
+            m.gram[i, j] = G[i, j]
 
 
 @kernel
 def _variance(count: int, b: Lumitexel, m: JointMemory) -> float:
     """Weighted mean square of the residuals at `m.x`."""
-    M = m.moments
+    rest = m.rest
     total = 0.0
     for c in range(3):
-        d = m.x[c]
-        total += M[SAMPLE + c, SAMPLE + c] + d * d * M[DIFFUSE, DIFFUSE]
-        total -= 2.0 * d * M[DIFFUSE, SAMPLE + c]
-        for i in range(LOBES):
-            x = m.x[3 + i]
-            total += 2.0 * x * (d * M[DIFFUSE, LOBE + i] - M[LOBE + i, SAMPLE + c])
-            for j in range(LOBES):
-                total += x * m.x[3 + j] * M[LOBE + i, LOBE + j]
+        rest[:] = 0.0
+        rest[SAMPLE + c] = 1.0
+        rest[DIFFUSE] = -m.x[c]
+        for j in range(LOBES):
+            rest[LOBE + j] = -m.x[3 + j]
+        for i in range(WIDTH):
+            for j in range(WIDTH):
+                total += rest[i] * m.moments[i, j] * rest[j]
     unknowns = UNKNOWNS if count >= MIN_SAMPLES_LOBES else FEW_UNKNOWNS
-    return max(
-        total / max(3.0 * count - unknowns, 1.0), _least_variance(count, b, m), 0.0
-    )
+    mean = total / max(3.0 * count - unknowns, 1.0)
+    return max(mean, _least_variance(count, b, m), 0.0)
 
 
 @kernel
@@ -392,19 +388,20 @@ def _add_scan(s: int, variance: float, lobes: Lobes, m: JointMemory) -> None:
     """Add the prior that the normal is that of the scan."""
     precision = variance / (lobes.scan_error * lobes.scan_error)
     for k in range(2):
-        m.turn[k, k] += precision
+        m.equations[TURN + k, TURN + k] += precision
         for q in range(3):
-            m.pull[k] += precision * m.axes[k, q] * lobes.scan[s, q]
+            m.right[TURN + k] += precision * m.axes[k, q] * lobes.scan[s, q]
 
 
 @kernel
 def _eliminate_normal(m: JointMemory) -> bool:
-    """Write the equations of the other parameters for the best normal (Schur complement);
-    `m.turn` becomes its inverse. Returns whether the normal is determined.
+    """Write the equations of the other parameters for the best normal (Schur complement),
+    and the inverse of those of the normal; returns whether it is determined.
     """
-    a = m.turn[0, 0]
-    d = m.turn[1, 1]
-    both = m.turn[0, 1]
+    G = m.equations
+    a = G[TURN, TURN]
+    d = G[TURN + 1, TURN + 1]
+    both = G[TURN, TURN + 1]
     det = a * d - both * both
     if not det > 1e-9 * a * d:
         return False
@@ -414,10 +411,10 @@ def _eliminate_normal(m: JointMemory) -> bool:
     m.turn[1, 0] = -both / det
     for i in range(PARAMETERS):
         for k in range(2):
-            lean = m.cross[i, 0] * m.turn[0, k] + m.cross[i, 1] * m.turn[1, k]
-            m.target[i] -= lean * m.pull[k]
+            lean = G[i, TURN] * m.turn[0, k] + G[i, TURN + 1] * m.turn[1, k]
+            m.target[i] -= lean * m.right[TURN + k]
             for j in range(PARAMETERS):
-                m.gram[i, j] -= lean * m.cross[j, k]
+                m.gram[i, j] -= lean * G[j, TURN + k]
         m.gram[i, i] = max(m.gram[i, i], 0.0)
     return True
 
@@ -461,9 +458,9 @@ def _turn_normal(
     for k in range(2):
         m.step[k] = 0.0
         for q in range(2):
-            rest = m.pull[q]
+            rest = m.right[TURN + q]
             for i in range(PARAMETERS):
-                rest -= m.cross[i, q] * m.x[i]
+                rest -= m.equations[i, TURN + q] * m.x[i]
             m.step[k] += m.turn[k, q] * rest
     size = math.sqrt(m.step[0] ** 2 + m.step[1] ** 2)
     shrink = min(lobes.step_fraction, MAX_STEP / max(size, 1e-12))
@@ -472,25 +469,6 @@ def _turn_normal(
         m.normal[k] = m.turned[k]
     _face(m.normal, eta, lobes.square, b, m)
     _write_lobes(count, lobes, b, m)
-
-
-@kernel
-def _invert(k: int, active: IntVector, m: JointMemory) -> bool:
-    """Write the inverse of the equations of the k active parameters and the normal;
-    returns whether they are independent.
-    """
-    size = k + 2
-    G = m.equations
-    for i in range(k):
-        for j in range(k):
-            G[i, j] = m.gram[active[i], active[j]]
-        for q in range(2):
-            G[i, k + q] = m.cross[active[i], q]
-            G[k + q, i] = m.cross[active[i], q]
-    for p in range(2):
-        for q in range(2):
-            G[k + p, k + q] = m.turn[p, q]
-    return invert(G, np.arange(size), size, m.shared, m.cholesky, m.inverse)
 
 
 @kernel
@@ -565,15 +543,17 @@ def _write_errors(
     independent samples (White 1980), and for errors by light and by camera (Cameron,
     Gelbach and Miller 2011).
     """
-    active = np.arange(PARAMETERS)
+    active = np.arange(UNKNOWNS)
     k = 3
     for j in range(3, PARAMETERS):
         if m.x[j] > 0.0:
             active[k] = j
             k += 1
-    if not _invert(k, active, m):
-        return
     size = k + 2
+    for q in range(2):
+        active[k + q] = TURN + q
+    if not invert(m.equations, active, size, m.shared, m.cholesky, m.inverse):
+        return
     _write_scores(count, k, active, b, m)
     for p in range(size):
         for q in range(p + 1):
@@ -682,16 +662,5 @@ def fit_jointly(block: Block, lobes: Lobes, o: Options, out: JointFit) -> None:
     b = block_memory(block, 0)
     m = joint_memory(block.light.shape[0], block.camera.shape[0])
     for s in range(block.position.shape[0]):
-        n = block.normal[s]
-        known = np.isfinite(n).all() and np.isfinite(block.diffuse[s]).all()
-        if not known or not np.isfinite(block.position[s]).all():
-            continue
-        unpack(block.sample[s], b.values)
-        if sample_status(b.values) != FITTED:
-            continue
-        write_directions(block.position[s], block.light, block.camera, b)
-        write_gloss(block.polarisation, o.eta, b)
-        write_cosines(n, o.eta, MIN_COSINE_SURFACE, b)
-        if choose(b) < MIN_SAMPLES_LAMBERT:
-            continue
-        _fit(s, write_samples(n, b), block, lobes, o, b, m, out)
+        if prepare(s, block, o, b) == FITTED:
+            _fit(s, write_samples(block.normal[s], b), block, lobes, o, b, m, out)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from skindb.jit import (
+    all_finite,
     bits_float,
     fast_kernel,
     float_bits,
@@ -448,17 +449,19 @@ def prepare(surfel: int, block: Block, options: Options, b: Lumitexel) -> int:
     status = sample_status(b.values)
     if status != FITTED:
         return status
-    if not np.isfinite(position).all():
+    if not all_finite(position):
         return NOT_FINITE
     write_directions(position, block.light, block.camera, b)
     write_gloss(block.polarisation, options.eta, b)
     write_cosines(n, options.eta, MIN_COSINE_SURFACE, b)
-    if not np.isfinite(n).all():
-        finite = np.isfinite(b.values).sum() // 3
-        return FEW if finite < MIN_SAMPLES_LAMBERT else UNDETERMINED
+    if not all_finite(n):
+        finite = 0
+        for i in range(b.values.shape[0]):
+            finite += int(abs(b.values[i]) < np.inf)
+        return FEW if finite // 3 < MIN_SAMPLES_LAMBERT else UNDETERMINED
     if choose(b) < MIN_SAMPLES_LAMBERT:
         return FEW
-    return FITTED if np.isfinite(block.diffuse[surfel]).all() else NO_DIFFUSE
+    return FITTED if all_finite(block.diffuse[surfel]) else NO_DIFFUSE
 
 
 @kernel
@@ -473,7 +476,7 @@ def start_fit(
     out.half_angle[surfel] = math.degrees(seen)
     if options.solve:
         return count < options.min_samples, seen
-    return not np.isfinite(out.parameters[surfel]).all(), seen
+    return not all_finite(out.parameters[surfel]), seen
 
 
 @kernel

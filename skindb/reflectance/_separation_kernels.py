@@ -13,6 +13,7 @@ import numpy as np
 
 from skindb.jit import (
     LANES,
+    all_finite,
     fast_kernel,
     inline_kernel,
     kernel,
@@ -547,8 +548,7 @@ def separate_block(
     s = separation_memory(b.pairs.shape[0])
     for i in range(block.position.shape[0]):
         unpack(block.sample[i], b.values)
-        known = np.isfinite(block.normal[i]).all()
-        if sample_status(b.values) == UNSEEN or not known:
+        if sample_status(b.values) == UNSEEN or not all_finite(block.normal[i]):
             continue
         # squares of values far outside the range of reflectance would overflow
         power = scale_to_one(b.values) if largest_finite(b.values) > MAX_SAMPLE else 1.0

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import hashlib
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -77,14 +77,9 @@ def read_tables(path: str | Path) -> Dictionary:
     """
     path = Path(path)
     arrays = _load(path)
-    faults = [
-        *_node_faults(path, arrays),
-        *_shape_faults(path, arrays),
-        *_unit_faults(path, arrays),
-    ]
-    faults = faults or _value_faults(path, arrays)
+    faults = [*_layout_faults(arrays)] or [*_value_faults(arrays)]
     if faults:
-        raise InputError(faults)
+        raise InputError([Fault(f"{path}[{name}]", *fault) for name, *fault in faults])
     brdf = arrays[TABLE]
     nodes = (arrays["theta_h"], arrays["theta_d"], arrays["phi_d"])
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -182,175 +177,93 @@ def _channel_mean(brdf: AnyArray) -> Array:
     return np.asarray(grey.mean(axis=-1) if grey.ndim == 4 else grey)
 
 
-def _node_faults(path: Path, arrays: Mapping[str, AnyArray]) -> list[Fault]:
-    faults = []
-    for name, minimum in zip(NODES, (2, 2, 1), strict=True):
-        nodes = arrays[name]
-        place = f"{path}[{name}]"
-        if nodes.ndim != 1 or len(nodes) < minimum:
-            faults.append(
-                Fault(
-                    place,
-                    f"must be a one-dimensional array of at least {minimum} nodes",
-                    f"the shape {nodes.shape}",
-                    "add the nodes",
-                )
-            )
-        elif not (np.diff(nodes) > 0).all():
-            faults.append(
-                Fault(
-                    place,
-                    "nodes must be in strictly ascending order",
-                    "another order",
-                    "sort nodes and table, and remove repeated nodes",
-                )
-            )
-        else:
-            faults += _range_faults(name, nodes, place)
-    return faults
+Faults = Iterator[tuple[str, ...]]  # array, rule, what was found, cure if there is one
 
 
-def _shape_faults(path: Path, arrays: Mapping[str, AnyArray]) -> list[Fault]:
+def _layout_faults(arrays: Mapping[str, AnyArray]) -> Faults:
+    """Faults of nodes, shapes and units."""
+    for name in NODES:
+        for fault in _node_faults(name, arrays[name]):
+            yield name, *fault
     brdf = arrays[TABLE]
     lengths = tuple(arrays[name].size for name in NODES)
-    if (
-        brdf.ndim not in (4, 5)
-        or brdf.shape[1:4] != lengths
-        or brdf.shape[4:] not in ((), (3,))
-        or not len(brdf)
-    ):
-        return [
-            Fault(
-                f"{path}[{TABLE}]",
-                f"must have the shape (materials, {', '.join(map(str, lengths))}), or with "
-                "RGB (..., 3)",
-                str(brdf.shape),
-                "transpose it, or correct the nodes",
-            )
-        ]
-    names = (
-        [str(name) for name in np.atleast_1d(arrays["names"])]
-        if "names" in arrays
-        else []
-    )
-    if "names" in arrays and (len(names) != len(brdf) or len(set(names)) != len(brdf)):
-        return [
-            Fault(
-                f"{path}[names]",
-                f"{len(brdf)} materials must have as many different names",
-                f"{len(names)} names, {len(set(names))} of them different",
-            )
-        ]
-    return []
+    channels = brdf.shape[4:] in ((), (3,))
+    if brdf.ndim < 4 or brdf.shape[1:4] != lengths or not channels or not len(brdf):
+        rule = (
+            f"must have the shape (materials, {', '.join(map(str, lengths))}), or with "
+            "RGB (..., 3)"
+        )
+        yield TABLE, rule, str(brdf.shape), "transpose it, or correct the nodes"
+    elif "names" in arrays:
+        names = [str(name) for name in np.atleast_1d(arrays["names"])]
+        different = len(set(names))
+        if not len(names) == different == len(brdf):
+            rule = f"{len(brdf)} materials must have as many different names"
+            yield "names", rule, f"{len(names)} names, {different} of them different"
+    units = str(arrays.get("units", UNITS[0]))
+    if units not in UNITS:
+        yield "units", "the unit of a BRDF must be sr-1", units, "convert the table"
+    disc = arrays.get("disc_angular_radius", np.zeros(()))
+    if disc.shape != () or disc.dtype.kind not in "fiu" or not 0 <= disc < 0.5:
+        rule = "must be one angle from 0 to 0.5 rad"
+        cure = "omit it for tables of point lights"
+        yield "disc_angular_radius", rule, str(disc), cure
 
 
-def _range_faults(name: str, nodes: Array, place: str) -> list[Fault]:
+def _node_faults(name: str, nodes: Array) -> Faults:
     """Faults of nodes that are not in rad or do not span their axis; the outermost
     value is used beyond them.
     """
+    minimum = 1 if name == "phi_d" else 2
+    if nodes.ndim != 1 or len(nodes) < minimum:
+        rule = f"must be a one-dimensional array of at least {minimum} nodes"
+        yield rule, f"the shape {nodes.shape}", "add the nodes"
+        return
     low = float(nodes[0])
     high = float(nodes[-1])
-    if high > 2 * np.pi:
-        return [
-            Fault(
-                place,
-                "angles must be in rad",
-                f"{high:g}",
-                "convert them with numpy.radians",
-            )
-        ]
-    if name == "phi_d":
+    extent = f"[{low:g}, {high:g}]"
+    if not (np.diff(nodes) > 0).all():
+        cure = "sort nodes and table, and remove repeated nodes"
+        yield "nodes must be in strictly ascending order", "another order", cure
+    elif high > 2 * np.pi:
+        yield "angles must be in rad", f"{high:g}", "convert them with numpy.radians"
+    elif name == "phi_d" and (low < 0 or high > np.pi - 1e-9):
+        cure = (
+            "average both halves, as a reciprocal isotropic BRDF has period pi, "
+            "and omit the end"
+        )
+        yield "nodes must lie in [0, pi)", extent, cure
+    elif name == "phi_d":
         gap = float(np.diff(nodes, append=nodes[0] + np.pi).max())
-        if low < 0 or high > np.pi - 1e-9:
-            return [
-                Fault(
-                    place,
-                    "nodes must lie in [0, pi)",
-                    f"[{low:g}, {high:g}]",
-                    "average both halves, as a reciprocal isotropic BRDF has period pi, "
-                    "and omit the end",
-                )
-            ]
         if gap > np.pi / 2 + 1e-9 and len(nodes) > 1:
             rule = (
                 "neighbouring nodes must be at most pi/2 apart, also across the end of "
                 "the period"
             )
-            return [Fault(place, rule, f"a gap of {gap:.3g}", "add nodes")]
+            yield rule, f"a gap of {gap:.3g}", "add nodes"
     elif low < 0 or high > np.pi / 2 + 1e-6 or low > 0.2 or high < np.pi / 2 - 0.2:
         rule = "nodes must extend from 0 to pi/2 rad, with at most 0.2 missing at either end"
-        return [
-            Fault(
-                place,
-                rule,
-                f"[{low:g}, {high:g}]",
-                "add nodes, with NaN where nothing was measured",
-            )
-        ]
-    return []
+        yield rule, extent, "add nodes, with NaN where nothing was measured"
 
 
-def _unit_faults(path: Path, arrays: Mapping[str, AnyArray]) -> list[Fault]:
-    faults = []
-    if "units" in arrays and str(arrays["units"]) not in UNITS:
-        unit = str(arrays["units"])
-        faults.append(
-            Fault(
-                f"{path}[units]",
-                "the unit of a BRDF must be sr-1",
-                unit,
-                "convert the table",
-            )
-        )
-    disc = arrays.get("disc_angular_radius", np.zeros(()))
-    if disc.shape != () or disc.dtype.kind not in "fiu" or not 0 <= disc < 0.5:
-        faults.append(
-            Fault(
-                f"{path}[disc_angular_radius]",
-                "must be one angle from 0 to 0.5 rad",
-                str(disc),
-                "omit it for tables of point lights",
-            )
-        )
-    return faults
-
-
-def _value_faults(path: Path, arrays: Mapping[str, AnyArray]) -> list[Fault]:
+def _value_faults(arrays: Mapping[str, AnyArray]) -> Faults:
     brdf = arrays[TABLE]
-    place = f"{path}[{TABLE}]"
-    faults = []
-    if np.isinf(brdf).any():
-        counts = f"{np.isinf(brdf).sum()} infinite ones"
-        cure = "replace them by NaN"
-        faults.append(Fault(place, "values must be finite or NaN", counts, cure))
-    if (brdf < 0).any():
+    infinite = int(np.isinf(brdf).sum())
+    negative = int((brdf < 0).sum())
+    if infinite:
+        rule = "values must be finite or NaN"
+        yield TABLE, rule, f"{infinite} infinite ones", "replace them by NaN"
+    if negative:
         cure = "use NaN where nothing was measured, and 0 where no light is reflected"
-        faults.append(
-            Fault(
-                place,
-                "a BRDF must not be negative",
-                f"{(brdf < 0).sum()} values below 0",
-                cure,
-            )
-        )
+        yield TABLE, "a BRDF must not be negative", f"{negative} values below 0", cure
     nodes = arrays["theta_h"], arrays["theta_d"], arrays["phi_d"]
-    holes = np.array(
-        [
-            hole_fraction(_channel_mean(brdf_of_material), nodes)
-            for brdf_of_material in brdf
-        ]
-    )
+    holes = np.array([hole_fraction(_channel_mean(one), nodes) for one in brdf])
     if (holes > MAX_HOLE_FRACTION).any():
-        counts = f"{holes.max():.0%} in material {int(holes.argmax())}"
-        faults.append(
-            Fault(
-                place,
-                f"at most {MAX_HOLE_FRACTION:.0%} of the nodes above the horizon may be NaN",
-                counts,
-                "measure more directions, or remove the material",
-            )
+        rule = (
+            f"at most {MAX_HOLE_FRACTION:.0%} of the nodes above the horizon may be NaN"
         )
-    return faults
+        counts = f"{holes.max():.0%} in material {int(holes.argmax())}"
+        yield TABLE, rule, counts, "measure more directions, or remove the material"
 
 
 def read_merl(path: str | Path) -> tuple[Array, int]:
