@@ -244,7 +244,7 @@ class Archive:
         """Write a content under its digest, unless the guard raises."""
         key = content_key(digest)
         try:
-            self.place.create(key, content, guard=guard, flush_names=False)
+            self.place.create(key, content, guard=guard)
         except Changed:
             # in a bucket, where the guard is called afterwards too
             self.place.remove(key)

@@ -53,24 +53,26 @@ class ShardedArray(BackendArray):
         return np.asarray(values[(slice(None, None, step), *others)])
 
     def rows(self, begin: int, end: int) -> AnyArray:
-        """Values from `begin` to `end` along the first dim."""
-        out = np.empty((end - begin, *self.shape[1:]), self.dtype)
-        while begin < end:
-            number = begin // self.shard
-            stop = min(end, (number + 1) * self.shard)
-            self._decode(number, begin, stop, out[len(out) - (end - begin) :])
-            begin = stop
-        return out
+        """Values from `begin` to `end` along the first dim, from whole chunks."""
+        low = begin // self.chunk * self.chunk
+        high = min(-(-end // self.chunk) * self.chunk, self.shape[0])
+        out = np.empty((max(high - low, 0), *self.shape[1:]), self.dtype)
+        start = low
+        while start < high:
+            stop = min(high, (start // self.shard + 1) * self.shard)
+            self._decode(start, stop, out[start - low : stop - low])
+            start = stop
+        return out[begin - low : end - low]
 
-    def _decode(self, number: int, begin: int, end: int, out: AnyArray) -> None:
-        """Write the values from `begin` to `end`, which are in one object, to `out`."""
+    def _decode(self, begin: int, end: int, out: AnyArray) -> None:
+        """Write the chunks from `begin` to `end`, which are in one object, to `out`."""
+        number = begin // self.shard
         key = f"{self.name}/c/{number}{'/0' * (len(self.shape) - 1)}"
-        origin = number * self.shard
-        first = (begin - origin) // self.chunk
-        last = -(-(end - origin) // self.chunk)
+        first = begin % self.shard // self.chunk
+        last = first + len(range(begin, end, self.chunk))
         index_bytes = INDEX_BYTES * (self.shard // self.chunk) + CHECKSUM_BYTES
         start = 0
-        if first == 0 and end == min(origin + self.shard, self.shape[0]):
+        if first == 0 and end == min(begin + self.shard, self.shape[0]):
             content = memoryview(self.store.read(key))
             index = content[-index_bytes:]
         else:
@@ -81,19 +83,16 @@ class ShardedArray(BackendArray):
         if not content:
             start = int(table[:, 0].min())
             content = memoryview(self.store.read(key, start, int(table.sum(1).max())))
-        row = self.dtype.itemsize * int(np.prod(self.shape[1:]))
+        size = self.chunk * self.dtype.itemsize * int(np.prod(self.shape[1:]))
         target = out.reshape(-1).view(np.uint8)
-        for place, (offset, length) in enumerate(table.tolist(), first):
-            low = origin + place * self.chunk
+        for place, (offset, length) in enumerate(table.tolist()):
             source = content[offset - start : offset - start + length]
-            a = max(low, begin)
-            b = min(low + self.chunk, end)
-            values = target[(a - begin) * row : (b - begin) * row]
-            if b - a == self.chunk:
+            values = target[place * size : (place + 1) * size]
+            if len(values) == size:
                 blosc.decompress(source, values)
-            else:  # the first or last chunk
+            else:  # the last chunk of the array
                 chunk = np.frombuffer(blosc.decompress(source), np.uint8)
-                values[:] = chunk[(a - low) * row : (b - low) * row]
+                values[:] = chunk[: len(values)]
 
 
 def open_version(

@@ -25,7 +25,6 @@ from skindb.store.archive import (
     Changed,
     Item,
     State,
-    content_key,
     intact,
     items_of,
     other_files,
@@ -224,7 +223,6 @@ def _write_state(place: Place, archive: Archive, lease: Lease) -> BackupReport:
     ]
     for digest, content in draft.additions.items():
         archive.put(content, digest, guard)
-    archive.place.flush_names(content_key(digest) for digest in digests - stored)
     state = State(
         number=max(archive.numbers(), default=0) + 1,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -280,7 +278,6 @@ def _erased_states(
         for key, content in additions.items():
             files[key] = hashlib.sha256(content).hexdigest()
             archive.put(content, files[key], guard)
-        archive.place.flush_names(content_key(files[key]) for key in additions)
         changed = replace(
             state,
             files=files,

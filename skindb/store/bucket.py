@@ -15,7 +15,7 @@ import stat
 import tempfile
 import time
 import uuid
-from collections.abc import AsyncIterator, Callable, Hashable, Iterable, Mapping
+from collections.abc import AsyncIterator, Callable, Hashable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
@@ -208,7 +208,10 @@ class Bucket:
 
     def identities(self, key: str) -> dict[str, tuple[Hashable, ...]]:
         """The identity of every object below a key, by its path relative to the key."""
-        return {path: _identity(meta) for path, meta in self._objects(key).items()}
+        return {
+            path: (meta["size"], meta["e_tag"], meta["last_modified"])
+            for path, meta in self._objects(key).items()
+        }
 
     def modified(self, key: str) -> float:
         """Time in seconds, by the clock of the bucket, when an object or the newest
@@ -257,14 +260,7 @@ class Bucket:
                     )
                     raise OSError(errno.EIO, finding, self.where(path))
 
-    def create(
-        self,
-        key: str,
-        data: bytes,
-        *,
-        guard: Guard | None = None,
-        flush_names: bool = True,  # noqa: ARG002  objects are always durable
-    ) -> bool:
+    def create(self, key: str, data: bytes, *, guard: Guard | None = None) -> bool:
         """Write an object that must not exist yet; returns False and writes nothing if it exists.
 
         A guard is called before and after; if it raises the second time, the caller
@@ -276,9 +272,6 @@ class Bucket:
         if guard is not None and created:
             guard()
         return created
-
-    def flush_names(self, keys: Iterable[str]) -> None:
-        """Nothing: objects are always durable."""
 
     def _create(self, key: str, data: bytes) -> bool:
         """Write an object that must not exist yet.
@@ -446,10 +439,6 @@ class Bucket:
         """The key; `InputError` if it leads outside the prefix."""
         require_parts(self.name, key)
         return key
-
-
-def _identity(meta: Mapping[str, Any]) -> tuple[Hashable, ...]:
-    return meta["size"], meta["e_tag"], meta["last_modified"]
 
 
 class BucketStore(ListedStore):

@@ -6,7 +6,7 @@ import shutil
 import stat
 import sys
 import uuid
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable
 from contextlib import suppress
 from functools import partial
 from io import BufferedReader
@@ -169,29 +169,12 @@ class Folder:
             flush_path(Path(folder), mode=folders)
         self._flush_parents(place)
 
-    def create(
-        self,
-        key: str,
-        data: bytes,
-        *,
-        guard: Guard | None = None,
-        flush_names: bool = True,
-    ) -> bool:
+    def create(self, key: str, data: bytes, *, guard: Guard | None = None) -> bool:
         """Write a file durably if it does not exist yet; returns False and writes
         nothing if it exists.
         """
         # a link fails if the name exists; it is the only atomic step of a commit
-        return self._write(key, data, os.link, guard, flush_names=flush_names)
-
-    def flush_names(self, keys: Iterable[str]) -> None:
-        """Flush the folders of these files, and the folders above them."""
-        folders = {inside(self.root, key).parent for key in keys}
-        for folder in sorted(
-            folders | {parent for path in folders for parent in path.parents}
-        ):
-            if folder == self.root.parent or folder.is_relative_to(self.root):
-                with suppress(FileNotFoundError):  # a file that was not written
-                    flush_path(folder)
+        return self._write(key, data, os.link, guard)
 
     def replace(self, key: str, data: bytes, *, guard: Guard | None = None) -> None:
         """Write or replace a small file atomically and durably."""
@@ -232,8 +215,6 @@ class Folder:
         data: bytes,
         step: Callable[[Path, Path], None],
         guard: Guard | None,
-        *,
-        flush_names: bool = True,
     ) -> bool:
         """Write a temporary file, call the guard, and give the file its name by `step`;
         see `markers`.
@@ -242,8 +223,7 @@ class Folder:
         for _ in range(MAX_ATTEMPTS):
             try:
                 if self._try_write(final, data, step, guard):
-                    if flush_names:
-                        self._flush_parents(final)
+                    self._flush_parents(final)
                     return True
             except FileExistsError:
                 return False

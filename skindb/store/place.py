@@ -235,25 +235,13 @@ class Place(Protocol):
     def make_durable(self, key: str) -> None:
         """Return when everything below a key survives a power loss."""
 
-    def create(
-        self,
-        key: str,
-        data: bytes,
-        *,
-        guard: Guard | None = None,
-        flush_names: bool = True,
-    ) -> bool:
+    def create(self, key: str, data: bytes, *, guard: Guard | None = None) -> bool:
         """Write a file durably if it does not exist yet; returns False and writes
         nothing if it exists.
 
-        Without `flush_names`, the file may be missing after a power loss until
-        `flush_names` is called. The guard is called in the last step before the file
-        exists. In a bucket it is called again afterwards, and if it raises then, the
-        caller must remove the file.
+        The guard is called in the last step before the file exists. In a bucket it is
+        called again afterwards, and if it raises then, the caller must remove the file.
         """
-
-    def flush_names(self, keys: Iterable[str]) -> None:
-        """Return when the names of these files survive a power loss."""
 
     def replace(self, key: str, data: bytes, *, guard: Guard | None = None) -> None:
         """Write or replace a small file atomically; never for versions and their records.

@@ -152,7 +152,6 @@ def _write(archive: Archive, place: Place, plan: Plan) -> tuple[int, list[Record
     with Lease(place, "restore", (RELEASE,), command="skindb restore"):
         written = _copy_all(archive, place, plan)
         consents = _repeat_consents(place, plan)
-        place.flush_names([LOCK])
         place.remove(LOCK)
     place.is_unlocked = False
     note_withdrawals(place)
@@ -229,8 +228,7 @@ def _copy_all(archive: Archive, place: Place, plan: Plan) -> int:
     copied = intact(partial(_copy, archive, place), plan.items, plan.faults)
     written = sum(size for _, size in copied)
     for key, content in plan.texts.items():
-        place.create(key, content, flush_names=False)
-    place.flush_names([*(key for key, _, _ in plan.items), *plan.texts])
+        place.create(key, content)
     return written
 
 
@@ -250,7 +248,7 @@ def _remove_left(place: Place) -> None:
 def _copy(archive: Archive, place: Place, item: Item) -> int:
     """Copy a file; returns its size."""
     content = archive.read(item)
-    place.create(item[0], content, flush_names=False)
+    place.create(item[0], content)
     return len(content)
 
 

@@ -539,7 +539,6 @@ STEPS = (
     "read_small",
     "identities",
     "replace",
-    "flush_names",
     "remove",
 )
 
