@@ -26,7 +26,7 @@ from skindb.store.place import (
 )
 from skindb.store.record import Key, Record
 from skindb.store.stage import remove_version
-from skindb.store.verify import may_have_had_record, partly_removed_records, tombstones
+from skindb.store.verify import may_have_had_record
 
 STILL_WRITING_SECONDS = 3600.0  # newer files may belong to a run without a lease
 KEPT_BLOCK_SECONDS = 24 * 3600.0
@@ -72,8 +72,7 @@ def find_garbage(place: Place, generations: int | None = None) -> list[Garbage]:
         *_scratch_folders(place, now),
         *_unneeded_blocks(place, now),
     ]
-    unrecorded = partial(_unrecorded, tombstone_names=tombstones(place))
-    for key, of_take in (("data", unrecorded), ("leases", _abandoned_leases)):
+    for key, of_take in (("data", _unrecorded), ("leases", _abandoned_leases)):
         for kind, take in takes_below(place, key):
             if not markers.hides(kind, take):
                 with suppress(InputError):
@@ -132,9 +131,7 @@ def _remove_one(place: Place, item: Garbage) -> bool:
     return True
 
 
-def _unrecorded(
-    place: Place, kind: str, take: str, now: Clock, *, tombstone_names: set[str]
-) -> Iterator[Garbage]:
+def _unrecorded(place: Place, kind: str, take: str, now: Clock) -> Iterator[Garbage]:
     """Versions and files beside them that no record names, and records whose removal
     was interrupted.
     """
@@ -143,7 +140,7 @@ def _unrecorded(
     names = place.children(key)
     log = Log(place, kind, take)
     records, faults = log.faults()
-    for record in partly_removed_records(log, records, tombstone_names):
+    for record in (one for one in records if log.is_removed(one.seal)):
         description = f"generation {record.generation}, whose removal was interrupted"
         reason = _in_use_reason(place, kind, take)
         yield Garbage(

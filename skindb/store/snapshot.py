@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 from bisect import insort
 from collections.abc import Hashable, Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -309,17 +308,13 @@ class RecordCache:
     @collection_paused()
     def __init__(self, place: Place) -> None:
         self.place = place
-        with ThreadPoolExecutor(4) as pool:
-            listed = pool.submit(list_records, place)
-            heads = pool.submit(_list_heads, place)
-            blocks = pool.submit(read_blocks, place)
-            markers = pool.submit(read_markers, place)
-        self._files = listed.result()
-        self._heads = heads.result()
-        self._markers = markers.result()
+        self._files = list_records(place)
+        self._heads = _list_heads(place)
+        blocks = read_blocks(place)
+        self._markers = read_markers(place)
         self.snapshot = Snapshot(place, self._markers)
         self._entries: dict[Key, Entry] = {}
-        for entries in blocks.result().values():
+        for entries in blocks.values():
             self._add_entries(entries or ())
         self._new: set[Key] = set()  # entries that no block holds
         # kind and take -> generations in ascending order

@@ -3,7 +3,6 @@ faults are reported together.
 """
 
 import re
-from collections.abc import Iterable
 from functools import partial
 
 import xarray as xr
@@ -15,7 +14,7 @@ from skindb.store.erasure import holdings_of
 from skindb.store.gathered import BLOCK_NAME as GATHERED_NAME
 from skindb.store.gathered import GATHERED
 from skindb.store.lease import NUMBER, abandoned_holder
-from skindb.store.log import GENERATION, RESTORE, Log, committed_logs, tombstone_of
+from skindb.store.log import GENERATION, RESTORE, Log, committed_logs
 from skindb.store.markers import SECRET, WITHDRAWN, marker_faults, read_markers
 from skindb.store.place import (
     AUDIT,
@@ -72,7 +71,6 @@ def database_faults(place: Place) -> list[Fault]:
     ]
     faults: list[Fault] = []
     records: list[Record] = []
-    tombstone_names = tombstones(place)
     damaged = set()  # logs with a missing or unreadable record
     for log in committed_logs(place):
         try:
@@ -80,12 +78,11 @@ def database_faults(place: Place) -> list[Fault]:
         except InputError as error:  # a link in place of the folder of a take
             readable = []
             broken = list(error.faults)
-        partly_removed = partly_removed_records(log, readable, tombstone_names)
         records += readable
         faults += broken
         damaged |= {log.what} if broken else set()
         for record in readable:
-            if record in partly_removed:
+            if log.is_removed(record.seal):
                 faults.append(_partly_removed_fault(record))
             else:
                 faults += version_faults(place, record)
@@ -237,27 +234,6 @@ def version_faults(place: Place, record: Record) -> list[Fault]:
         return faults or _record_faults(place, record, tables)
     except InputError as error:
         return list(error.faults)
-
-
-def tombstones(place: Place) -> set[str]:
-    """Names of all tombstones."""
-    return (
-        set(place.children("tombstones"))
-        if place.file_type("tombstones") == "folder"
-        else set()
-    )
-
-
-def partly_removed_records(
-    log: Log, records: Iterable[Record], tombstone_names: set[str]
-) -> list[Record]:
-    """Records that already have a tombstone, because their removal was interrupted."""
-    tombstoned = [
-        record
-        for record in records
-        if tombstone_of(record.seal).rpartition("/")[2] in tombstone_names
-    ]
-    return [record for record in tombstoned if log.is_removed(record.seal)]
 
 
 def _partly_removed_fault(record: Record) -> Fault:
