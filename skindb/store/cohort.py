@@ -57,7 +57,7 @@ class CohortRequest:
     surfels: int = 2000
     size: int = 512
     digest: str = ""  # of the code that computed the summary; empty for any
-    maps: tuple[str, ...] | None = None  # variables of the maps; by default all
+    variables: tuple[str, ...] | None = None  # by default all
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,6 @@ def cohort(
     request: CohortRequest,
     *,
     kind: str,
-    variables: Iterable[str] | None,
     takes: Sequence[str] | None,
     dim: str,
 ) -> xr.Dataset:
@@ -124,19 +123,11 @@ def cohort(
         repr(dim),
         "choose one",
     )
-    chosen = None if variables is None else list(variables)
     base = "registration" if layout == "maps" else kind
     names, skipped = _members(lookup, base, takes)
     records = {take: lookup.record(base, take) for take in names}
     stored = _stored_records(lookup, records, request)
-    parts = _parts(lookup, stored, request, chosen)
-    if layout == "tables" and len(parts) > FEW_TAKES:
-        url = lookup.place.address()
-        sources = table_sources(Address.of(url, version) for version in stored.values())
-        parts = [
-            replace(part, source=source)
-            for part, source in zip(parts, sources, strict=True)
-        ]
+    parts = _parts(lookup, stored, request)
     if empty := [
         part.take
         for part in parts
@@ -144,6 +135,7 @@ def cohort(
     ]:
         parts = [part for part in parts if part.take not in empty]
         skipped += [note(take, "none of its surfels was fitted") for take in empty]
+    chosen = request.variables
     if layout == "surfels" and chosen is None and not _have_same_dome(parts):
         parts = _without_samples(parts)
     sizes = {"surfel": request.surfels} if layout == "surfels" else {}
@@ -325,8 +317,10 @@ def _stored_record(
     if request.layout == "maps":
         # a summary may have some of the maps; all are those of the registration
         stored = record.contents.get("maps", NO_CONTENTS)["variables"]
-        names = stored if request.maps is None else request.maps
-        request = replace(request, maps=tuple(name for name in names if name in stored))
+        names = stored if request.variables is None else request.variables
+        request = replace(
+            request, variables=tuple(name for name in names if name in stored)
+        )
     for summary in reversed(lookup.history(SUMMARY, record.take)):
         sources = [(i["kind"], i["generation"], i["seal"]) for i in summary.made_from]
         if (record.kind, record.generation, record.seal) in sources and _has_data_for(
@@ -357,32 +351,35 @@ def _has_data_for(record: Record, request: CohortRequest) -> bool:
         return count >= request.surfels or is_complete
     return request.layout == "tables" or (
         contents["sizes"]["u"] == request.size
-        and set(request.maps or ()) <= set(contents["variables"])
+        and set(request.variables or ()) <= set(contents["variables"])
     )
 
 
 def _parts(
-    lookup: Lookup,
-    stored: Mapping[str, Record],
-    request: CohortRequest,
-    chosen: Sequence[str] | None,
+    lookup: Lookup, stored: Mapping[str, Record], request: CohortRequest
 ) -> list[Part]:
     """The part of each take, from the version with its data."""
     url = lookup.place.address()
+    group = GROUP[request.layout]
     needs_samples = request.layout == "surfels" and (
-        chosen is None or not {SAMPLES, *DOME}.isdisjoint(chosen)
+        request.variables is None or not {SAMPLES, *DOME}.isdisjoint(request.variables)
     )
+    addresses = [Address.of(url, version) for version in stored.values()]
+    sources: Iterable[Source] = (StoredGroup(one, group) for one in addresses)
+    if request.layout == "tables":
+        is_gathered = len(stored) > FEW_TAKES
+        sources = (
+            table_sources(addresses) if is_gathered else map(StoredTables, addresses)
+        )
     # identities of the contents of a version and of its capture, which thousands of
     # takes share -> these, and the layout
     layouts: dict[tuple[int, int], tuple[Contents, Contents, Layouts]] = {}
     parts = []
-    for take, version in stored.items():
-        address = Address.of(url, version)
-        contents = version.contents.get(GROUP[request.layout], NO_CONTENTS)
+    for (take, version), address, source in zip(
+        stored.items(), addresses, sources, strict=True
+    ):
+        contents = version.contents.get(group, NO_CONTENTS)
         dome = NO_CONTENTS
-        source: Source = StoredTables(address)
-        if request.layout != "tables":
-            source = StoredGroup(address, GROUP[request.layout])
         if needs_samples and "surfel_index" in contents["variables"]:
             capture = _capture_of(lookup, lookup.record("model", take))
             if capture is not None:

@@ -378,9 +378,8 @@ class Database:
         chosen = None if variables is None else tuple(variables)
         combined = cohort(
             lookup,
-            CohortRequest(layout, surfels, size, maps=chosen),
+            CohortRequest(layout, surfels, size, variables=chosen),
             kind=kind,
-            variables=chosen,
             takes=takes,
             dim=dim,
         )

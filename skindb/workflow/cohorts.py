@@ -93,7 +93,7 @@ def summarise(
     tables = CohortRequest("tables", digest=code)
     sample = CohortRequest("surfels", surfels=SAMPLED, digest=code)
     chosen = None if maps is None else tuple(maps)
-    map_request = CohortRequest("maps", size=size, digest=code, maps=chosen)
+    map_request = CohortRequest("maps", size=size, digest=code, variables=chosen)
     lookup = Lookup(db, release)
     registered = [take for take in names if lookup.has("registration", take)]
     steps = [
@@ -196,7 +196,7 @@ def _summarise_registration(db: Database, size: int, record: Record) -> Record:
 
 def _map(db: Database, request: CohortRequest, record: Record) -> Record:
     model, registered = _registered_model(db, record)
-    maps = common_maps(model, registered, size=request.size, maps=request.maps)
+    maps = common_maps(model, registered, size=request.size, maps=request.variables)
     return _commit_summary(
         db, record, {"maps": maps}, summary_parameters(size=request.size)
     )
