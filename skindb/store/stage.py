@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import threading
 import uuid
 import warnings
 from collections.abc import Iterable, Mapping
@@ -62,6 +63,7 @@ MAX_UNSHARDED_BYTES = 1 << 26  # larger arrays are written shard by shard
 TABLES = "tables"
 NAMES = "names"  # file beside a version with the takes that it refers to
 MAX_LABELS = 1000  # labels of longer dims are not listed in a record
+_WITHOUT_WARNINGS = threading.Lock()  # threads share the filters of warnings
 
 
 class Stage:
@@ -253,7 +255,8 @@ class Stage:
         store = self.place.writable(self.path)
         root = zarr.open_group(store, mode="a", zarr_format=3)
         root.attrs.put(attrs)
-        with warnings.catch_warnings():  # that format 3 does not specify them yet
+        # that format 3 does not specify them yet
+        with _WITHOUT_WARNINGS, warnings.catch_warnings():
             warnings.simplefilter("ignore")
             for group in (*sorted(self.groups), ""):
                 with suppress(FileNotFoundError):  # `_written_files` reports it

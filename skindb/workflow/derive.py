@@ -79,6 +79,9 @@ def _symbol(function: Callable[..., Any]) -> Symbol:
 @cache
 def _digest_of(root: Path, starts: tuple[Symbol, ...]) -> str:
     """From the cache on disk while no file of the package changes, as parsing takes a second."""
+    # modules may have been parsed before an edit, in a notebook
+    if package_digest.__wrapped__(root) != package_digest(root):
+        return _parsed_digest(root, starts)
     stored = cached_arrays(
         f"code-{starts[0][1]}",
         (starts, package_digest(root)),
