@@ -18,7 +18,7 @@ from sklearn.decomposition import PCA
 
 import skindb.bench
 from skindb.bench.curve import Curve, Point, cpu_time
-from skindb.bench.surface import DISC, unit
+from skindb.bench.surface import DISC
 from skindb.numerics.factorise import principal_axes
 from skindb.numerics.inference import permutation_p
 from skindb.optics.angles import directions, half_difference
@@ -39,6 +39,7 @@ from skindb.reflectance.dictionary import (
     embedded_dictionary,
 )
 from skindb.reflectance.tables import lookup
+from skindb.types import unit
 
 ETA = 1.3
 DISTANCE = (0.5, 1.0, 2.0, 5.0, 10.0)  # transport mean free paths

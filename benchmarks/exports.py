@@ -27,6 +27,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import imagecodecs
 import numpy as np
 import OpenEXR
 from scipy.ndimage import binary_erosion
@@ -37,7 +38,7 @@ from skindb.export import export_bundle
 from skindb.export.inputs import mean_free_path
 from skindb.geometry.rays import RayScene
 from skindb.optics.diffusion import dipole_profile, dipole_s, scattering_coefficients
-from skindb.render.image import read_png, tone_map, write_png
+from skindb.render.image import tone_map, write_png
 from skindb.render.rendering import chosen_camera
 from skindb.render.scene import Camera, Lights, Surface, from_model, lights_from_dome
 from skindb.render.shading import View, shade_view, trace_view
@@ -303,7 +304,8 @@ def report_spread(folder: Path) -> None:
 
 def draw(paths: list[Path], picture: Path) -> None:
     """Pairs of pictures in a row, without the dark columns and rows between them."""
-    halves = [half for path in paths for half in np.split(read_png(path), 2, axis=1)]
+    pictures = [imagecodecs.png_decode(path.read_bytes()) for path in paths]
+    halves = [half for pair in pictures for half in np.split(pair, 2, axis=1)]
     lit = np.any([half.max(axis=2) > 8 for half in halves], axis=0)
     rows, columns = (np.flatnonzero(lit.any(axis=axis)) for axis in (1, 0))
     write_png(

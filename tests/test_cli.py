@@ -25,7 +25,8 @@ from skindb.cli.fitting import _fit_lines
 from skindb.cli.shared import fault_lines
 from skindb.cli.studies import declarations
 from skindb.errors import Fault
-from skindb.render.image import read_exr, read_png
+from skindb.render.image import read_exr
+from tests.pictures import read_png
 
 COMMANDS = (
     "demo simulate calibrate capture landmarks quick import ingest fit dictionary analyze "

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from skindb.bench.curve import Curve, Point, cpu_time
-from skindb.bench.surface import spiral, unit
+from skindb.bench.surface import spiral
 from skindb.calibration._merge_kernels import OK
 from skindb.calibration.radiance import merge_exposures
 from skindb.fit import estimate_diffuse_reflectance, estimate_normals
@@ -20,7 +20,7 @@ from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.mixture import basis_rows
 from skindb.reflectance.separation import surface_lobes
 from skindb.schema import dataset, label, variables
-from skindb.types import Array, Mask, Values16, dots, finite_rows
+from skindb.types import Array, Mask, Values16, dots, finite_rows, unit
 from skindb.virtual.dome import Sensor
 
 ETA = 1.3

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from skindb.bench.curve import Curve, Point, cpu_time
+from skindb.bench.surface import spiral
 from skindb.errors import input_error
 from skindb.fit.translucency import ProbeFit, fit_profile
 from skindb.optics.diffusion import (
@@ -251,10 +252,7 @@ def subsurface_curves(quick: bool) -> list[Curve]:
 def _ball(spacing: float) -> tuple[Array, Array, Array]:
     """Points (n, 3) of a spiral on the ball, their areas and their irradiance (n, lights)."""
     n = round(4 * np.pi * RADIUS**2 / spacing**2)
-    z = 1 - (2 * np.arange(n) + 1) / n
-    phi = np.pi * (1 + 5**0.5) * (np.arange(n) + 0.5)
-    r = np.sqrt(1 - z * z)
-    points = RADIUS * np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
+    points = spiral(n, RADIUS, 2.0)
     light = np.random.default_rng(3).normal(size=(3, LIGHTS))
     light /= np.linalg.norm(light, axis=0)
     stripes = np.sin(points[:, 1:2] * np.pi / 4 + np.arange(LIGHTS)) > 0

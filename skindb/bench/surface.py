@@ -28,7 +28,7 @@ from skindb.reflectance.mixture import Mixture, basis_rows
 from skindb.reflectance.model import Block, Comparison, Judgement, SurfaceFit
 from skindb.reflectance.reduction import reduce_dictionary
 from skindb.reflectance.tables import brdf_metric, lookup
-from skindb.types import Array, dots, lengths
+from skindb.types import Array, dots, lengths, unit
 
 ETA = 1.3
 DISC = float(np.radians(0.8))
@@ -88,11 +88,6 @@ def spiral(count: int, radius: float, fraction: float) -> Array:
 def _single(values: Array) -> Array:
     """Values rounded to single precision, as they are stored."""
     return values.astype(np.float32).astype(float)
-
-
-def unit(v: Array) -> Array:
-    """Vectors (..., 3) of length one."""
-    return np.asarray(v / lengths(v)[..., None])
 
 
 def strip(

@@ -264,8 +264,7 @@ def approximation_error(
     dict
         `relative_rms` and `relative_rms_perceptual` (in cube-root space) over lights
         and cameras in all directions above the surface, weighted by the area that a
-        pixel sees; `relative_rms_lobes` over directions uniform in (sqrt theta_h,
-        theta_d, phi_d), which gives more weight to highlights and grazing light.
+        pixel sees.
     """
     pairs = _pairs()
     through = (
@@ -285,7 +284,6 @@ def approximation_error(
         "relative_rms_perceptual": _relative(
             np.cbrt(ours), np.cbrt(theirs), pairs.weight
         ),
-        "relative_rms_lobes": _relative(ours, theirs, np.ones_like(pairs.weight)),
     }
 
 

@@ -27,12 +27,6 @@ def encode_srgb(linear: ArrayLike) -> Float64:
     )
 
 
-def decode_srgb(display: ArrayLike) -> Float64:
-    """Decode sRGB display values in [0, 1] to linear values (IEC 61966-2-1)."""
-    y = float64(display)
-    return np.where(y <= 0.04045, y / 12.92, ((y + 0.055) / 1.055) ** 2.4)
-
-
 def auto_exposure(radiance: ArrayLike, *, mask: Mask | None = None) -> float:
     """Exposure that maps the brightest lit pixels (99.5 % quantile of the largest
     channel) to display white.
@@ -83,16 +77,6 @@ def write_png(path: str | Path, picture: AnyArray) -> None:
     private_file(path).write_bytes(
         imagecodecs.png_encode(np.ascontiguousarray(picture))
     )
-
-
-def read_png(path: str | Path) -> AnyArray:
-    """Read the values of a PNG in the dtype of the file (uint8 or uint16)."""
-    try:
-        return np.asarray(imagecodecs.png_decode(_bytes(path)))
-    except (ValueError, RuntimeError):  # RuntimeError comes from the decoder
-        raise input_error(
-            str(path), "must be a PNG image", DAMAGED, "write the file again"
-        ) from None
 
 
 def write_exr(

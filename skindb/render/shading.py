@@ -263,59 +263,6 @@ class View:
         )
 
 
-def render_view(
-    surface: Surface,
-    camera: Camera,
-    lights: Lights,
-    *,
-    samples: int = 1,
-    disc_samples: int = 4,
-    subsurface: bool = False,
-    terms: Collection[str] = TERMS,
-    scene: RayScene | None = None,
-    glow: Image | None = None,
-) -> Image:
-    """One linear image per light (Weyrich et al. 2005, eq. 1 to 4 and 8).
-
-    Parameters
-    ----------
-    surface, camera, lights
-        The surface, the camera that sees it, and the lights.
-    samples
-        Rays per pixel and axis; pixels are averaged over samples**2 rays.
-    disc_samples
-        Points on each light's disc per ray. The rays of a pixel use different points; a
-        single point is the centre.
-    subsurface
-        Whether diffuse light travels through the skin (dipole, eq. 9) instead of
-        leaving where it enters.
-    terms
-        Terms of the BRDF to include: "diffuse", "surface" or both.
-    scene
-        Ray tracer of this surface, if already built; all cameras of a subject can share it.
-    glow
-        (l, v, 3) `exitances` of these lights, if already computed; all cameras can share them.
-
-    Returns
-    -------
-    ndarray
-        (l, h, w, 3) float32 radiance; 0 where no surface is visible.
-        `trace_view(...).coverage` is the alpha.
-    """
-    rays = RayScene(surface.vertices, surface.faces) if scene is None else scene
-    view = trace_view(surface, camera, samples=samples, scene=rays)
-    return shade_view(
-        view,
-        surface,
-        lights,
-        rays,
-        disc_samples=disc_samples,
-        subsurface=subsurface,
-        terms=terms,
-        glow=glow,
-    )
-
-
 def trace_view(
     surface: Surface,
     camera: Camera,
@@ -402,7 +349,30 @@ def shade_view(
     terms: Collection[str] = TERMS,
     glow: Image | None = None,
 ) -> Image:
-    """Images (l, h, w, 3) of a traced view, one per light; parameters as in `render_view`."""
+    """One linear image per light (Weyrich et al. 2005, eq. 1 to 4 and 8).
+
+    Parameters
+    ----------
+    view, surface, lights, scene
+        The traced view of a camera, the surface that it sees, the lights, and the ray tracer
+        of the surface.
+    disc_samples
+        Points on each light's disc per ray. The rays of a pixel use different points; a
+        single point is the centre.
+    subsurface
+        Whether diffuse light travels through the skin (dipole, eq. 9) instead of
+        leaving where it enters.
+    terms
+        Terms of the BRDF to include: "diffuse", "surface" or both.
+    glow
+        (l, v, 3) `exitances` of these lights, if already computed; all cameras can share them.
+
+    Returns
+    -------
+    ndarray
+        (l, h, w, 3) float32 radiance; 0 where no surface is visible. `View.coverage` is the
+        alpha.
+    """
     if unknown := set(terms) - set(TERMS):
         raise ValueError(f"terms must be among {TERMS}, found {sorted(unknown)}")
     diffuse = view.interpolate(surface.diffuse) * float(

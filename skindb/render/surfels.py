@@ -167,27 +167,9 @@ def evaluate(model: xr.DataTree, surfel: int, wi: ArrayLike, wo: ArrayLike) -> F
     --------
     >>> f_r = evaluate(model, 1200, wi=[0.0, 0.0, 1.0], wo=[0.0, 0.6, 0.8])  # doctest: +SKIP
     """
-    fitted = model["fitted"].to_dataset()
-    basis = model["basis"].to_dataset()
-    reflectance = surface_model(basis)
-    names = (*NEEDED, *reflectance.parameter_variables, variables.REFRACTIVE_INDEX)
-    check(fitted, names, where="fitted")
-    values = _values_of(fitted, surfel, reflectance)
-    to_light, to_camera = np.broadcast_arrays(_unit("wi", wi), _unit("wo", wo))
-    shape = to_light.shape
-    to_light = to_light.reshape(-1, 3)
-    to_camera = to_camera.reshape(-1, 3)
-    normal, diffuse, parameters = (
-        np.broadcast_to(values[name], (len(to_light), values[name].shape[1]))
-        for name in (
-            variables.SHADING_NORMAL,
-            variables.DIFFUSE_REFLECTANCE,
-            "parameters",
-        )
-    )
-    points = Points(np.zeros_like(to_light), normal, to_camera, diffuse, parameters)
-    eta = float(fitted[variables.REFRACTIVE_INDEX])
-    f_r = _brdfs(reflectance, points, to_light, eta)
+    rows, surface, to_light, to_camera, shape = _rows_of(model, surfel, wi, wo)
+    points = _points(rows, surface, to_camera)
+    f_r = _brdfs(surface, points, to_light, float(rows[variables.REFRACTIVE_INDEX]))
     return np.asarray(f_r.reshape(shape), np.float32)
 
 
@@ -222,15 +204,8 @@ def evaluate_error(
     InputError
         As `evaluate`.
     """
-    fitted = model["fitted"].to_dataset()
-    surface = surface_model(model["basis"].to_dataset())
-    check(fitted, ERROR_INPUTS, where="fitted")
-    _values_of(fitted, surfel, surface)
-    to_light, to_camera = np.broadcast_arrays(_unit("wi", wi), _unit("wo", wo))
-    shape = to_light.shape
-    to_light = to_light.reshape(-1, 3)
-    to_camera = to_camera.reshape(-1, 3)
-    rows = fitted.isel(surfel=np.full(len(to_light), surfel))
+    check(model["fitted"].to_dataset(), ERROR_INPUTS, where="fitted")
+    rows, surface, to_light, to_camera, shape = _rows_of(model, surfel, wi, wo)
     errors = reflectance_errors(rows, surface, to_light, to_camera)
     return np.asarray(errors.reshape(shape), np.float32)
 
@@ -240,19 +215,15 @@ def reflectance_errors(
 ) -> Array:
     """`evaluate_error` (n, 3) of n surfels for unit directions (n, 3), one of each."""
     eta = float(fitted[variables.REFRACTIVE_INDEX])
-    normal = fitted[variables.SHADING_NORMAL].values.astype(np.float64)
-    normal /= lengths(normal)[..., None]
-    parameters = surface.parameters_of(fitted)
-    none = np.zeros((len(normal), 0))
-    points = Points(
-        np.zeros_like(normal), normal, to_camera, even_diffuse(fitted), parameters
-    )
+    points = _points(fitted, surface, to_camera)
+    normal = points.normal
     total = _brdfs(surface, points, to_light, eta)
     gloss = points._replace(diffuse=np.zeros_like(normal))
     shown = _brdfs(surface, gloss, to_light, eta)
     turn = _to_measured(fitted, normal, to_light, to_camera)
     turned = gloss._replace(view=turn.apply(to_camera))
     measured = _brdfs(surface, turned, turn.apply(to_light), eta)
+    none = np.zeros((len(normal), 0))
     unit = points._replace(diffuse=np.ones_like(normal), parameters=none)
     through = _brdfs(surface, unit, to_light, eta)
     albedo = fitted[variables.SURFACE_REFLECTANCE].values[:, None]
@@ -308,12 +279,25 @@ def _brdfs(
     return np.asarray(f_r)
 
 
-def _values_of(
-    fitted: xr.Dataset, surfel: int, reflectance: ReflectanceModel
-) -> dict[str, Array]:
-    """Values of `NEEDED` and the parameters of one surfel, each with a leading dimension of
-    length one.
+def _points(fitted: xr.Dataset, surface: ReflectanceModel, to_camera: Array) -> Points:
+    """Surfels as points, each seen from a direction (n, 3)."""
+    normal = fitted[variables.SHADING_NORMAL].values.astype(np.float64)
+    normal /= lengths(normal)[..., None]
+    parameters = surface.parameters_of(fitted)
+    position = np.zeros_like(normal)
+    return Points(position, normal, to_camera, even_diffuse(fitted), parameters)
+
+
+def _rows_of(
+    model: xr.DataTree, surfel: int, wi: ArrayLike, wo: ArrayLike
+) -> tuple[xr.Dataset, ReflectanceModel, Array, Array, tuple[int, ...]]:
+    """One surfel, checked and repeated for every pair of directions, its surface model, the
+    directions (n, 3), and their shape.
     """
+    fitted = model["fitted"].to_dataset()
+    surface = surface_model(model["basis"].to_dataset())
+    names = (*NEEDED, *surface.parameter_variables, variables.REFRACTIVE_INDEX)
+    check(fitted, names, where="fitted")
     count = fitted.sizes["surfel"]
     if not 0 <= surfel < count:
         raise input_error(
@@ -322,12 +306,11 @@ def _values_of(
             str(surfel),
             "choose a surfel of this model",
         )
-    names = [*NEEDED, *reflectance.parameter_variables]
-    names += [variables.EVEN_REFLECTION] * (variables.EVEN_REFLECTION in fitted)
-    row = fitted[names].isel(surfel=[surfel]).compute()
+    to_light, to_camera = np.broadcast_arrays(_unit("wi", wi), _unit("wo", wo))
+    shape = to_light.shape
+    row = fitted.isel(surfel=[surfel]).compute()
     values = {name: np.asarray(row[name].values) for name in NEEDED}
-    values[variables.DIFFUSE_REFLECTANCE] = even_diffuse(row)
-    values["parameters"] = reflectance.parameters_of(row)
+    values["parameters"] = surface.parameters_of(row)
     if not usable_surfels(values)[0]:
         status = FitStatus(int(values[variables.FIT_STATUS][0]))
         raise input_error(
@@ -336,7 +319,9 @@ def _values_of(
             f"the status {status.name} ({status.explanation})",
             "choose a surfel whose fit_status is FITTED",
         )
-    return values
+    to_light = to_light.reshape(-1, 3)
+    rows = row.isel(surfel=np.zeros(len(to_light), int))
+    return rows, surface, to_light, to_camera.reshape(-1, 3), shape
 
 
 def _unit(name: str, direction: ArrayLike) -> Array:

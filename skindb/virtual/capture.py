@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from functools import cache
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,13 @@ TRUE_SPACING = 1.5
 SCAN_SPACING = 3.6
 SCAN_NOISE = 0.08  # mm each, smooth and white
 DEVICE_SEED = 2005
+SITE_TRUTH = (  # fields of a site in the file of the truth
+    "position",
+    "diffuse_reflectance",
+    "sigma_tr",
+    "sigma_a",
+    "sigma_s_prime",
+)
 SCAN_REGIONS = ("forehead", "nose", "cheek", "lips", "chin", "neck", "beard")
 
 
@@ -230,7 +238,12 @@ def simulate_take(
     """
     _require_empty(out)
     total = len(dome.cameras) + 3
-    report = _Steps(f"simulate {person.take}", total, progress)
+    steps = count(1)
+
+    def report() -> None:
+        if progress is not None:
+            progress(f"simulate {person.take}", next(steps), total)
+
     geometry_rng, frame_rng, probe_rng = rng.spawn(3)
     dictionary, albedo = _materials()
     head, scan = _heads(person, spacing_mm, geometry_rng)
@@ -267,21 +280,6 @@ def simulate_take(
         ),
     )
     report()
-
-
-class _Steps:
-    """Counts steps for the progress callback."""
-
-    def __init__(self, stage: str, total: int, progress: Progress | None) -> None:
-        self.stage = stage
-        self.total = total
-        self.progress = progress
-        self.done = 0
-
-    def __call__(self) -> None:
-        self.done += 1
-        if self.progress:
-            self.progress(self.stage, self.done, self.total)
 
 
 def _require_empty(out: Path) -> None:
@@ -372,14 +370,13 @@ def _write_truth(
     subsurface: bool,
 ) -> None:
     """Write the true parameters of the take at the vertices of the true surface."""
-    members = {
-        name: values.astype(np.float32) for name, values in head.membership.items()
-    }
-    touched: dict[str, Any] = (
-        {}
-        if probe is None
-        else {"probe_distance": probe.distance, "probe_profile": probe.profile}
-    )
+    touched: dict[str, Any] = {}
+    if probe is not None:
+        touched = {"probe_distance": probe.distance, "probe_profile": probe.profile}
+    for name in SITE_TRUTH:
+        values = [getattr(site, name) for site in skin.sites]
+        touched[f"site_{name}"] = np.array(values).reshape(-1, 3)
+    lambertian = [np.mean(abc_parameters()[name][:3]) for name in MATERIALS]
     np.savez(
         private_file(out.with_name(out.name + ".truth.npz")),
         vertices=head.vertices,
@@ -389,23 +386,13 @@ def _write_truth(
         surface_weights=skin.weights,
         surface_names=np.array(MATERIALS),
         # includes the Lambertian albedo of the materials, which no fit can distinguish from R_d
-        surface_lambertian=skin.weights
-        @ np.array([np.mean(abc_parameters()[name][:3]) for name in MATERIALS]),
+        surface_lambertian=skin.weights @ np.array(lambertian),
         sigma_tr=skin.sigma_tr,
-        region_names=np.array(list(members)),
-        region_membership=np.stack(list(members.values()), axis=1),
-        landmark_names=np.array(list(head.landmarks)),
-        landmark_position=np.array(list(head.landmarks.values())).reshape(-1, 3),
+        region_names=np.array([*head.membership]),
+        region_membership=np.stack([*head.membership.values()], 1).astype(np.float32),
+        landmark_names=np.array([*head.landmarks]),
+        landmark_position=np.array([*head.landmarks.values()]).reshape(-1, 3),
         site_names=np.array([site.name for site in skin.sites]),
-        site_position=np.array([site.position for site in skin.sites]).reshape(-1, 3),
-        site_diffuse_reflectance=np.array(
-            [site.diffuse_reflectance for site in skin.sites]
-        ).reshape(-1, 3),
-        site_sigma_tr=np.array([site.sigma_tr for site in skin.sites]).reshape(-1, 3),
-        site_sigma_a=np.array([site.sigma_a for site in skin.sites]).reshape(-1, 3),
-        site_sigma_s_prime=np.array(
-            [site.sigma_s_prime for site in skin.sites]
-        ).reshape(-1, 3),
         light_intensity=np.array([light.intensity for light in dome.lights]),
         eta=np.array(eta),
         subsurface=np.array(subsurface),

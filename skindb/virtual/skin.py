@@ -58,14 +58,6 @@ class ConditionEffect:
 
 
 @dataclass(frozen=True)
-class Gloss:
-    """Surface reflection of a region."""
-
-    albedo: float  # at normal incidence
-    fractions: tuple[float, ...]  # of MATERIALS in it
-
-
-@dataclass(frozen=True)
 class SkinTables:
     """The constants of skin.json."""
 
@@ -73,7 +65,8 @@ class SkinTables:
     mean: dict[tuple[str, str], Float64]  # ancestry and gender -> R_d (site, channel)
     # ancestry and gender -> relative standard deviation between people, green, cheek
     spread: dict[tuple[str, str], float]
-    gloss: dict[str, Gloss]  # by region; "elsewhere" for the others
+    # by region, "elsewhere" for the others: albedo at normal incidence, fractions of MATERIALS
+    gloss: dict[str, list[float]]
     sigma_tr: dict[str, Float64]  # paper, table 2: site -> mean (channel,) in mm^-1
     effects: dict[str, ConditionEffect]  # by condition
 
@@ -110,7 +103,7 @@ def skin_tables() -> SkinTables:
         {group: np.array(row["mean"]) for group, row in people.items()},
         {group: row["spread"] for group, row in people.items()},
         {
-            region: Gloss(row["albedo"], tuple(row["fractions"]))
+            region: [row["albedo"], *row["fractions"]]
             for region, row in tables["gloss"].items()
         },
         {site: np.array(mean) for site, mean in tables["sigma_tr"].items()},
@@ -258,8 +251,7 @@ def _weights(
     """Smooth non-negative weights with the wanted specular albedo at normal incidence."""
     rng = person.stream(4)
     p = head.vertices
-    gloss = skin_tables().gloss
-    rows = {name: [row.albedo, *row.fractions] for name, row in gloss.items()}
+    rows = skin_tables().gloss
     names = [name for name in rows if name in head.membership]
     member = np.stack([head.membership[name] for name in names], axis=1)
     rest = np.clip(1 - member.sum(axis=1), 0, 1)

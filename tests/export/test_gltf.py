@@ -15,8 +15,9 @@ from skindb.errors import InputError
 from skindb.export.gltf import export_gltf
 from skindb.export.textures import fit_material
 from skindb.reflectance.tables import kernel_tables
-from skindb.render.image import decode_srgb, encode_srgb
+from skindb.render.image import encode_srgb
 from skindb.schema import FitStatus
+from tests.pictures import decode_srgb
 
 SIZE = 64
 

@@ -26,7 +26,7 @@ from skindb.reflectance.brdf_files import read_dictionary
 from skindb.reflectance.mixture import Mixture
 from skindb.render.image import read_exr, write_exr
 from skindb.render.scene import Camera, Lights, Surface, from_model
-from skindb.render.shading import render_view
+from tests.pictures import render_view
 
 pytestmark = pytest.mark.slow
 

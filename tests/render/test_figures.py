@@ -8,7 +8,7 @@ import xarray as xr
 
 from skindb.errors import InputError
 from skindb.render.figures import field_figure, trace_front, write_grid
-from skindb.render.image import read_png
+from tests.pictures import read_png
 
 SIDE = 9
 

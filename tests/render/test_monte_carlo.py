@@ -27,12 +27,8 @@ from skindb.render.monte_carlo import (
     stratified,
 )
 from skindb.render.scene import Camera, Environment, Lights, Surface
-from skindb.render.shading import (
-    exitance_from_irradiance,
-    render_view,
-    trace_view,
-    tree_opening,
-)
+from skindb.render.shading import exitance_from_irradiance, trace_view, tree_opening
+from tests.pictures import render_view
 
 LEVEL = 1e-5  # probability with which a right renderer fails a z-test of a picture
 

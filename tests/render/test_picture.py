@@ -11,7 +11,7 @@ from skindb.optics.diffusion import dipole_s
 from skindb.optics.fresnel import circular_reversal
 from skindb.reflectance.tables import stored_brdf
 from skindb.render import shading
-from skindb.render.image import decode_srgb, read_exr, read_png, write_exr
+from skindb.render.image import read_exr, write_exr
 from skindb.render.monte_carlo import Lighting
 from skindb.render.photographs import compare_photographs
 from skindb.render.rendering import (
@@ -21,8 +21,8 @@ from skindb.render.rendering import (
     sum_over_lights,
 )
 from skindb.render.scene import cameras_from_dome, from_model, lights_from_dome
-from skindb.render.shading import render_view
 from skindb.schema import dataset
+from tests.pictures import decode_srgb, read_png, render_view
 
 
 @pytest.fixture

@@ -28,8 +28,9 @@ from skindb.render.scene import (
     from_model,
     lights_from_dome,
 )
-from skindb.render.shading import render_view, trace_view
+from skindb.render.shading import trace_view
 from skindb.schema import FitStatus, Use, dataset, label, names_of
+from tests.pictures import render_view
 from tests.small_face import small_face
 
 ETA = 1.3

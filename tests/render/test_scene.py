@@ -24,8 +24,9 @@ from skindb.render.scene import (
     lights_from_dome,
     subdivide_surface,
 )
-from skindb.render.shading import exitances, render_view
+from skindb.render.shading import exitances
 from skindb.schema import FitStatus, dataset, label
+from tests.pictures import render_view
 
 
 def model(status: list[int], *, translucent: bool = True) -> xr.DataTree:

@@ -14,12 +14,8 @@ from skindb.geometry.rays import RayScene
 from skindb.optics.diffusion import dipole_s
 from skindb.reflectance.mixture import Mixture
 from skindb.render.scene import Camera, Lights, Surface
-from skindb.render.shading import (
-    exitances,
-    render_view,
-    trace_view,
-    transmitted_irradiance,
-)
+from skindb.render.shading import exitances, trace_view, transmitted_irradiance
+from tests.pictures import render_view
 
 FLOAT32 = 2e-6
 LAMBERT = 1.0  # index at which Fresnel lets everything pass

@@ -15,7 +15,6 @@ from scipy.ndimage import binary_erosion
 from small_face import LIGHTS, small_face
 
 from skindb.reflectance.tables import kernel_tables, stored_brdf
-from skindb.render.image import decode_srgb
 from skindb.render.rendering import render
 from skindb.render.scene import (
     Camera,
@@ -25,7 +24,7 @@ from skindb.render.scene import (
     from_model,
     lights_from_dome,
 )
-from skindb.render.shading import render_view, trace_view
+from skindb.render.shading import trace_view
 from skindb.schema import dataset
 from skindb.view.face import (
     Trait,
@@ -45,6 +44,7 @@ from skindb.view.page import (
     write_folder,
     write_page,
 )
+from tests.pictures import decode_srgb, render_view
 
 WIDTH = 256  # px of the canvas that is compared
 PICTURE = "(skindb.draw(), document.getElementById('canvas').toDataURL('image/png'))"

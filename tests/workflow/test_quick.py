@@ -21,9 +21,10 @@ from skindb.cli import main
 from skindb.errors import InputError
 from skindb.format.frames import read_frame, write_frame
 from skindb.ingest import import_images
-from skindb.render.image import read_exr, read_png
+from skindb.render.image import read_exr
 from skindb.store.lease import this_process
 from skindb.workflow.studies import _require_one_scale
+from tests.pictures import read_png
 
 LIGHTS = directions(13)
 

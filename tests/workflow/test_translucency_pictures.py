@@ -9,10 +9,10 @@ from small_face import small_face
 
 from skindb.cli import cli
 from skindb.errors import InputError
-from skindb.render.image import read_png
 from skindb.schema import dataset
 from skindb.store import Database
 from skindb.workflow import pictures, translucency_grid
+from tests.pictures import read_png
 
 pytestmark = pytest.mark.slow
 
