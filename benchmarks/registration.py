@@ -229,10 +229,10 @@ def against(
         .values.astype(float)
     )
     print(
-        "\n| landmarks | click [mm] | smoothing | warp | condition | face [mm] | "
+        "\n| landmarks | click [mm] | smoothing | warp | face [mm] | "
         "all [mm] | anchors | flipped |"
     )
-    print("|---|" + 8 * "---|")
+    print("|---|" + 7 * "---|")
     for case in cases:
         count = case.get("count", len(order))
         click = case.get("click", 0.0)
@@ -244,15 +244,12 @@ def against(
             sorted({result.attrs["warp_kind"] for result in registered.values()})
         )
         smoothings = [result.attrs["warp_smoothing"] for result in registered.values()]
-        condition = max(
-            result.attrs["warp_condition"] for result in registered.values()
-        )
         range_text = (
             f"{max(smoothings):.3g}"
             if max(smoothings) == min(smoothings)
             else f"{min(smoothings):.3g} to {max(smoothings):.3g}"
         )
-        row = f"| {count} | {click:g} | {range_text} | {kinds} | {condition:.0f} |"
+        row = f"| {count} | {click:g} | {range_text} | {kinds} |"
         anchors, flips = (
             sum(result.attrs[f"warp_{name}"] for result in registered.values())
             for name in ("anchors", "flips")

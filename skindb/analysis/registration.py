@@ -69,7 +69,7 @@ def register(
     dict
         Take -> `common_uv`, `common_landmark`, `landmark_residual`,
         `landmark_prediction_error`, `landmark_used`. Attributes describe the warp:
-        `warp_kind`, `warp_condition`, `warp_smoothing`, `warp_anchors`, `warp_flips`
+        `warp_kind`, `warp_smoothing`, `warp_anchors`, `warp_flips`
         (number of flipped triangles), `reference` and `template`. `mm_per_uv` is the
         scale of the common coordinates, from the distances of the landmarks.
     """
@@ -309,6 +309,7 @@ def _registration_dataset(
     )
     # anchors near a landmark depend on its position; the prediction error must be independent of it
     alone = fit_warp(source, target, smoothing=warp.smoothing)
+    anchors = 0 if warp.spline is None else int((warp.spline.loose > 1).sum())
     return dataset(
         {
             variables.COMMON_UV: common,
@@ -320,9 +321,8 @@ def _registration_dataset(
         },
         attrs={
             "warp_kind": warp.kind,
-            "warp_condition": warp.condition,
             "warp_smoothing": warp.smoothing,
-            "warp_anchors": int((warp.loose > 1).sum()),
+            "warp_anchors": anchors,
             "warp_flips": int(turned.sum()),
         },
     )
@@ -355,8 +355,7 @@ def tabulate_registration(registered: Registered) -> tuple[list[str], list[list[
     and number of further anchors.
     """
     header = (
-        "take warp landmarks condition_number smoothing misfit_mm predicted_mm "
-        "worst_mm worst anchors"
+        "take warp landmarks smoothing misfit_mm predicted_mm worst_mm worst anchors"
     ).split()
     rows: list[list[Any]] = []
     for take, registration in registered.items():
@@ -370,10 +369,7 @@ def tabulate_registration(registered: Registered) -> tuple[list[str], list[list[
             registration.attrs["warp_kind"],
             int(registration[variables.LANDMARK_USED].sum()),
         ]
-        row += [
-            float(registration.attrs["warp_condition"]),
-            float(registration.attrs["warp_smoothing"]),
-        ]
+        row += [float(registration.attrs["warp_smoothing"])]
         row += (
             [float(np.nanmax(misfit))]
             if np.isfinite(misfit).any() and len(registered) > 1

@@ -5,8 +5,10 @@ and corresponding points of two surfaces by a non-rigid alignment that starts fr
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+from scipy.interpolate import RBFInterpolator
 from scipy.spatial import cKDTree
 
 from skindb.geometry.landmarks import similarity, width
@@ -47,8 +49,8 @@ SMOOTHING_STEP = 4.0
 GRID = 64
 MARGIN = 4.0
 NEIGHBOURS = 20  # of a centre, to which lines are checked for folds
-# points times centres: 2 MB of doubles, which stay in the cache
-PRODUCTS_PER_BLOCK = 1 << 18
+FAR = 100.0  # half length in spreads of the grid where the map is nearly affine
+SLOPE_STEP = 1e-5  # of differences, in spreads
 ALIGNED = 3  # number of shared landmarks that an alignment requires
 # width of the landmarks over their length, below which the rotation is undetermined
 MIN_LANDMARK_WIDTH_RATIO = 0.05
@@ -81,19 +83,44 @@ MAX_OUTLINE_DISTANCE_MM = 30.0
 
 @dataclass(frozen=True)
 class Warp:
-    """A map of the plane: `affine` of (1, x), and `weight` of r^2 log r round each centre."""
+    """A map of the plane: a thin-plate spline, or else `affine` of (1, x)."""
 
     kind: str  # "thin plate", "affine", "similarity", "shift" or "identity"
     origin: Array  # (2,)
     scale: float  # x = (uv - origin) / scale
-    centre: Array  # (c, 2) in x
-    weight: Array  # (c, 2)
     affine: Array  # (3, 2)
-    condition: float  # of the regularised system; 1 without one
-    smoothing: float  # added to its diagonal, in units of x
-    loose: Array  # (c,) times that
     # (k,) of the points; False: not finite, or merged with one before
     used: Mask
+    spline: Spline | None = None
+
+    @property
+    def smoothing(self) -> float:
+        """Added to the diagonal of the system of the spline, in units of x."""
+        return 0.0 if self.spline is None else self.spline.smoothing
+
+
+@dataclass(frozen=True)
+class Spline:
+    """Points of a thin-plate spline in x, and their images."""
+
+    centre: Array  # (c, 2)
+    goal: Array  # (c, 2)
+    smoothing: float  # added to the diagonal of its system, in units of x
+    loose: Array  # (c,) times that
+
+    @cached_property
+    def map(self) -> RBFInterpolator:
+        """The spline through these points."""
+        smoothing = self.smoothing * self.loose
+        return RBFInterpolator(
+            self.centre, self.goal, smoothing=smoothing, kernel="thin_plate_spline"
+        )
+
+    def without(self, i: int) -> Spline:
+        """The spline without one of its points."""
+        parts = (self.centre, self.goal, self.loose)
+        centre, goal, loose = (np.delete(part, i, axis=0) for part in parts)
+        return Spline(centre, goal, self.smoothing, loose)
 
 
 def fit_warp(
@@ -166,20 +193,8 @@ def _without_folds(
     checked = _check_points(centre) * base.scale + base.origin
     for smoothing, loosening in attempts:
         loose = np.where(is_weak, loosening * WEAK_SMOOTHING_FACTOR, 1.0)
-        system = _System.of(centre, loose)
-        weight, affine = system.solve(goal, smoothing)
-        warp = replace(
-            base,
-            kind="thin plate",
-            centre=centre,
-            weight=weight,
-            affine=affine,
-            condition=system.condition(smoothing),
-            smoothing=smoothing,
-            loose=loose,
-        )
-        if np.linalg.det(affine[1:]) <= min_area:
-            continue
+        spline = Spline(centre, goal, smoothing, loose)
+        warp = replace(base, kind="thin plate", spline=spline)
         if area_factor(warp, checked).min() * base.scale**2 > min_area:
             return warp
     return None
@@ -200,81 +215,35 @@ def _attempts(smoothing: float | None, has_weak: bool) -> list[tuple[float, floa
 def apply_warp(warp: Warp, uv: Array) -> Float64:
     """Apply the map to points (n, 2)."""
     points = (float64(uv) - warp.origin) / warp.scale
-    out = _linear(points) @ warp.affine
-    if len(warp.centre):
-        for block in _blocks(points, warp):
-            out[block] += _bending(points[block], warp.centre) @ warp.weight
-    return out
+    if warp.spline is not None:
+        return float64(warp.spline.map(points))
+    return _linear(points) @ warp.affine
 
 
 def area_factor(warp: Warp, uv: Array) -> Float64:
     """Determinant of the Jacobian (n,) at points (n, 2): negative where the map is folded."""
-    points = (float64(uv) - warp.origin) / warp.scale
-    out = np.empty(len(points))
-    for block in _blocks(points, warp):
-        slope = _slope(points[block], warp.centre, warp.weight)
-        (a, b), (c, d) = np.moveaxis(warp.affine[1:] + slope, 0, 2)
-        out[block] = a * d - b * c
-    return out / warp.scale**2
+    step = SLOPE_STEP * warp.scale * np.eye(2)
+    points = float64(uv)
+    (a, b), (c, d) = (
+        ((apply_warp(warp, points + h) - apply_warp(warp, points - h)) / 2).T
+        for h in step
+    )
+    return float64((a * d - b * c) / (SLOPE_STEP * warp.scale) ** 2)
 
 
 def left_out_error(warp: Warp) -> Float64:
-    """Leave-one-out error (k,): distance of each point from its image by the map of the
-    others (Rippa 1999).
+    """Leave-one-out error (k,): distance of each point from its image by the map of the others.
 
     NaN for points that are not used, and if there is no thin-plate map. The others
     include weak points.
     """
     out = np.full(len(warp.used), np.nan)
-    if len(warp.centre):
-        inverse = _System.of(warp.centre, warp.loose).inverse(warp.smoothing)
-        # divided by the root of 1: none is weak
-        error = lengths(warp.weight) / np.diag(inverse)
-        out[warp.used] = error[: warp.used.sum()]
+    if warp.spline is not None:
+        spline = warp.spline
+        for i, place in enumerate(np.flatnonzero(warp.used)):
+            image = spline.without(i).map(spline.centre[i : i + 1])[0]
+            out[place] = np.linalg.norm(image - spline.goal[i])
     return out
-
-
-@dataclass(frozen=True)
-class _System:
-    """Bending energy of centres on the complement of affine maps, where it is positive definite.
-
-    Rows and columns are divided by the square root of `loose`, so that the same is
-    added to all of the diagonal.
-    """
-
-    centre: Array  # (c, 2)
-    loose: Array  # (c,)
-    kernel: Array  # (c, c)
-    linear: Array  # (c, 3)
-    complement: Array  # (c, c - 3) orthonormal, orthogonal to `linear`
-    value: Array  # (c - 3,) eigenvalues, ascending
-    vector: Array  # (c - 3, c - 3)
-
-    @classmethod
-    def of(cls, centre: Array, loose: Array) -> _System:
-        root = np.sqrt(loose)[:, None]
-        kernel = _bending(centre, centre) / (root * root.T)
-        linear = _linear(centre) / root
-        complement = np.linalg.qr(linear, mode="complete")[0][:, 3:]
-        value, vector = np.linalg.eigh(complement.T @ kernel @ complement)
-        return cls(centre, loose, kernel, linear, complement, value, vector)
-
-    def condition(self, smoothing: float) -> float:
-        if not len(self.value):
-            return 1.0
-        return float((self.value[-1] + smoothing) / (self.value[0] + smoothing))
-
-    def inverse(self, smoothing: float) -> Float64:
-        """Matrix that maps targets to weights, both scaled like the rows."""
-        vector = self.complement @ self.vector
-        return vector / (self.value + smoothing) @ vector.T
-
-    def solve(self, target: Array, smoothing: float) -> tuple[Array, Array]:
-        root = np.sqrt(self.loose)[:, None]
-        weight = self.inverse(smoothing) @ (target / root)
-        residual = target / root - self.kernel @ weight - smoothing * weight
-        affine = np.linalg.lstsq(self.linear, residual, rcond=None)[0]
-        return weight / root, affine
 
 
 def _merged(source: Array, target: Array) -> tuple[Float64, Float64, Mask]:
@@ -319,49 +288,16 @@ def _plain(
     matrix: Array,
     shift: Array,
 ) -> Warp:
-    return Warp(
-        kind,
-        origin,
-        scale,
-        centre=np.zeros((0, 2)),
-        weight=np.zeros((0, 2)),
-        affine=np.vstack([shift, matrix]),
-        condition=1.0,
-        smoothing=0.0,
-        loose=np.zeros(0),
-        used=is_used,
-    )
+    return Warp(kind, origin, scale, np.vstack([shift, matrix]), is_used)
 
 
 def _linear(points: Array) -> Float64:
     return np.concatenate([np.ones((len(points), 1)), points], axis=1)
 
 
-def _bending(points: Array, centre: Array) -> Float64:
-    """r^2 log r (n, c)."""
-    squared = (points[:, :1] - centre[:, 0]) ** 2 + (points[:, 1:] - centre[:, 1]) ** 2
-    logarithm = np.log(np.maximum(squared, np.finfo(np.float64).tiny))
-    return 0.5 * squared * logarithm
-
-
-def _slope(points: Array, centre: Array, weight: Array) -> Float64:
-    """Gradient (n, 2, 2) of the weighted sum of r^2 log r: (2 log r + 1) times the
-    vector from each centre.
-    """
-    x = points[:, :1] - centre[:, 0]
-    y = points[:, 1:] - centre[:, 1]
-    factor = np.log(np.maximum(x * x + y * y, np.finfo(np.float64).tiny)) + 1
-    return np.stack([(factor * x) @ weight, (factor * y) @ weight], axis=1)
-
-
-def _blocks(points: Array, warp: Warp) -> list[slice]:
-    size = max(1, PRODUCTS_PER_BLOCK // max(1, len(warp.centre)))
-    return [slice(i, i + size) for i in range(0, len(points), size)]
-
-
 def _check_points(centre: Array) -> Float64:
-    """Points that are checked for folds: an even grid, the centres, and points between
-    neighbouring centres.
+    """Points that are checked for folds: an even grid, far ones, where the map is nearly
+    affine, the centres, and points between neighbouring centres.
     """
     side = np.linspace(-MARGIN, MARGIN, GRID)
     even = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
@@ -369,7 +305,7 @@ def _check_points(centre: Array) -> Float64:
     i = np.repeat(np.arange(len(centre)), count)
     j = cKDTree(centre).query(centre, count)[1].ravel()
     between = [t * centre[i] + (1 - t) * centre[j] for t in (0.1, 0.5)]
-    return np.concatenate([even, centre, *between])
+    return np.concatenate([even, FAR / MARGIN * even, centre, *between])
 
 
 @dataclass(frozen=True)
