@@ -8,9 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from scipy import ndimage
+from scipy.sparse import csr_array
 
 from skindb.export.inputs import chosen_size, mean_free_path, required
 from skindb.geometry.atlas import atlas_values, push_pull, rasterise_atlas
+from skindb.geometry.interreflection import tangent_frames as perpendicular_frames
 from skindb.reflectance.kinds import as_mixture, even_diffuse
 from skindb.render.surfels import surfel_confidence, surfel_texels, texel_codes
 from skindb.schema import VARIABLES, TexelStatus, variables
@@ -21,6 +23,7 @@ from skindb.types import (
     Float32,
     Float64,
     Index32,
+    dots,
     finite_rows,
     lengths,
     unit,
@@ -232,28 +235,24 @@ def tangent_frames(
     """
     corner = position[triangles].astype(float)
     place = uv[triangles].astype(float)
-    edge = corner[:, 1:] - corner[:, :1]
-    step = place[:, 1:] - place[:, :1]
-    area = step[:, 0, 0] * step[:, 1, 1] - step[:, 1, 0] * step[:, 0, 1]
-    regular = np.abs(area) > 1e-20
-    scale = np.where(regular, 1 / np.where(regular, area, 1.0), 0.0)[:, None]
-    along_u = (edge[:, 0] * step[:, 1, 1:] - edge[:, 1] * step[:, 0, 1:]) * scale
+    first, second = (corner[:, i] - corner[:, 0] for i in (1, 2))
+    one, other = (place[:, i] - place[:, 0] for i in (1, 2))
+    area = one[:, 0] * other[:, 1] - other[:, 0] * one[:, 1]
+    side = np.where(np.abs(area) > 1e-20, np.sign(area), 0.0)[:, None]
+    along_u = side * (first * other[:, 1:] - second * one[:, 1:])
     # towards decreasing v
-    up = -(edge[:, 1] * step[:, 0, :1] - edge[:, 0] * step[:, 1, :1]) * scale
-    along_u, up = (x / np.maximum(lengths(x)[..., None], 1e-30) for x in (along_u, up))
-    sums = np.zeros((2, len(position), 3))
-    for k in range(3):
-        a, b = (corner[:, (k + i) % 3] - corner[:, k] for i in (1, 2))
-        cosine = (a * b).sum(axis=1) / np.maximum(lengths(a) * lengths(b), 1e-30)
-        angle = np.arccos(np.clip(cosine, -1, 1))[:, None]
-        for total, direction in zip(sums, (along_u, up), strict=True):
-            np.add.at(total, triangles[:, k], direction * angle)
-    tangent = sums[0] - (sums[0] * normal).sum(axis=1, keepdims=True) * normal
-    length = lengths(tangent)[..., None]
-    tangent = np.where(
-        length > 1e-9, tangent / np.maximum(length, 1e-9), _any_perpendicular(normal)
+    up = side * (first * other[:, :1] - second * one[:, :1])
+    after, before = (
+        unit(np.roll(corner, k, axis=1) - corner).reshape(-1, 3) for k in (-1, 1)
     )
-    sign = np.where((np.cross(normal, tangent) * sums[1]).sum(axis=1) < 0, -1.0, 1.0)
+    angle = np.arccos(np.clip(dots(after, before), -1, 1))
+    index = (triangles.ravel(), np.repeat(np.arange(len(triangles)), 3))
+    at_vertices = csr_array((angle, index), shape=(len(position), len(triangles)))
+    total, upwards = (at_vertices @ unit(x) for x in (along_u, up))
+    tangent = total - dots(total, normal)[:, None] * normal
+    is_clear = lengths(tangent)[:, None] > 1e-9
+    tangent = np.where(is_clear, unit(tangent), perpendicular_frames(normal)[:, 0])
+    sign = np.where(dots(np.cross(normal, tangent), upwards) < 0, -1.0, 1.0)
     return np.concatenate([tangent, sign[:, None]], axis=1)
 
 
@@ -262,16 +261,5 @@ def to_tangent_space(direction: Array, normal: Array, tangent: Array) -> Float64
     `tangent_frames`.
     """
     bitangent = np.cross(normal, tangent[:, :3]) * tangent[:, 3:]
-    return np.stack(
-        [
-            (direction * axis).sum(axis=1)
-            for axis in (tangent[:, :3], bitangent, normal)
-        ],
-        axis=1,
-    )
-
-
-def _any_perpendicular(normal: Array) -> Float64:
-    axis = np.where(np.abs(normal[:, :1]) < 0.9, [[1.0, 0, 0]], [[0.0, 1, 0]])
-    tangent = np.cross(normal, axis)
-    return unit(tangent)
+    axes = (tangent[:, :3], bitangent, normal)
+    return np.stack([dots(direction, axis) for axis in axes], axis=1)

@@ -47,9 +47,6 @@ UNITS = "radiance"  # in the unit of the photographs, or of the environment
 NO_LIGHTS = Lights(
     np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros(0)
 )
-# directions over the sphere, for the irradiance of the white surface that defines
-# exposures
-DIRECTIONS = 512
 
 
 def radiance_of(
@@ -441,14 +438,10 @@ def fixed_exposure(lighting: Lighting, camera: Camera) -> float:
         )
         mean += float(power.sum()) / 4
     if lighting.environment is not None:
-        k = np.arange(DIRECTIONS) + 0.5
-        height = 1 - 2 * k / DIRECTIONS
-        turn = k * np.pi * (3 - 5**0.5)
-        sine = np.sqrt(1 - height**2)
-        way = np.stack([sine * np.cos(turn), height, sine * np.sin(turn)], axis=1)
-        level = lighting.environment.along(way).mean(axis=1)
-        facing += float((level * np.maximum(way @ normal, 0)).mean()) * 4 * np.pi
-        mean += float(level.mean()) * np.pi
+        direction, energy = lighting.environment.texels()
+        level = energy.mean(axis=1)
+        facing += float((level * np.maximum(direction @ normal, 0)).sum())
+        mean += float(level.sum()) / 4
     irradiance = max(facing, 0.2 * mean)
     return float(np.pi / irradiance) if irradiance > 0 else 1.0
 
