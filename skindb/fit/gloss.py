@@ -199,7 +199,6 @@ def _shared(lobes: Array) -> Gloss:
 def _samples(lumitexels: xr.Dataset, surfels: int) -> xr.Dataset:
     """Some of the surfels, in memory, with what estimates need."""
     names = (*GEOMETRY, "surfel_normal", "noise_floor", *noise_inputs(lumitexels))
-    names += ("shot_noise",) if "shot_noise" in lumitexels else ()
     part = lumitexels[list(dict.fromkeys(names))]
     return part.isel(surfel=_spread(part.sizes["surfel"], surfels)).compute()
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from skindb.errors import Fault, InputError
 from skindb.parameters import SCAN_ERROR_DEGREES
 from skindb.reflectance.model import Block, Noise, typical_noise
-from skindb.schema import check, label, variables
+from skindb.schema import check, variables
 from skindb.types import Array
 
 Arrays = Mapping[str, NDArray[Any]]  # of a block of surfels, by variable
@@ -24,7 +24,6 @@ GEOMETRY = (
     "light_position",
     "camera_position",
 )
-SHOT = "shot_noise"
 RADIANCE = ("radiance_limit", "radiance_read_variance", "radiance_shot_variance")
 # captures of linear files or of unknown electrons have none of these
 NOISE_SAMPLES = ("effective_pixels", *RADIANCE)
@@ -43,7 +42,7 @@ REQUIRED = {
     "dome": ("light_position", "light_disc_radius", "camera_position"),
 }
 OPTIONAL = {
-    "samples": (SHOT, *NOISE_SAMPLES),
+    "samples": NOISE_SAMPLES,
     "dome": (
         *NOISE_LIGHTS,
         *POLARISATION,
@@ -91,8 +90,6 @@ def lumitexels(capture: xr.DataTree) -> xr.Dataset:
     merged = xr.merge(
         parts, compat="override", join="override", combine_attrs="override"
     )
-    if SHOT not in merged:
-        merged = merged.assign({SHOT: label(SHOT, 0.0)})
     # geometry and noise are read once: 60 bytes per surfel, compared with 14 kB of
     # samples for a full dome
     small = [name for name in merged.data_vars if name != "reflectance_sample"]
@@ -168,11 +165,8 @@ def noise_inputs(lumitexels: xr.Dataset) -> tuple[str, ...]:
 
 
 def take_noise(lumitexels: xr.Dataset) -> Noise:
-    """Noise of captures without the noise of each sample; zero if their photon noise is
-    unknown.
-    """
-    shot = float(lumitexels[SHOT]) if SHOT in lumitexels else 0.0
-    return typical_noise(float(lumitexels["noise_floor"]), shot)
+    """Noise of captures without the noise of each sample, whose photon noise is unknown."""
+    return typical_noise(float(lumitexels["noise_floor"]))
 
 
 def noise_of(arrays: Arrays, typical: Noise) -> Noise:

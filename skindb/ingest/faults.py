@@ -165,13 +165,11 @@ def _beyond(ratios: Float64, limit: float) -> list[tuple[int, float]]:
     """Rows of ratios (n, k) that differ from 1 by more than the limit, each with its
     most extreme ratio.
     """
-    out = []
-    for j, row in enumerate(ratios):
-        with np.errstate(divide="ignore"):
-            away = np.where(row > 0, np.abs(np.log(np.maximum(row, 1e-300))), np.inf)
-        if (away[~np.isnan(row)] > np.log(limit)).any():
-            out.append((j, float(row[np.nanargmax(np.where(np.isnan(row), -1, away))])))
-    return out
+    with np.errstate(divide="ignore"):
+        away = np.abs(np.log(np.maximum(ratios, 0.0)))
+    away = np.where(np.isnan(away), -1.0, away)
+    worst = enumerate(away.argmax(axis=1))
+    return [(j, float(ratios[j, k])) for j, k in worst if away[j, k] > np.log(limit)]
 
 
 def calibration_faults(dome: DomeRecord, calibration: Calibration) -> list[Fault]:

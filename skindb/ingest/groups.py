@@ -147,7 +147,6 @@ def sample_group(dome: DomeRecord, lumitexels: Lumitexels) -> xr.Dataset:
         "reflectance_sample": lumitexels.sample,
         **dict(zip(COUNTS, lumitexels.counts, strict=True)),
         "noise_floor": lumitexels.noise_floor,
-        "shot_noise": lumitexels.shot_noise,
     }
     coords = _dome_names(dome) | CHANNELS
     if (noise := lumitexels.noise) is not None:

@@ -66,8 +66,6 @@ FULL_SHADOW = 1e-3
 MIN_COSINE_CAMERA = 0.1  # between the normal and the direction to the camera
 # mm of surface covered by one pixel; beyond it, samples were measured 20 % too bright
 MAX_SMEAR_MM = 12.0
-# variance after bilinear interpolation over that of one pixel, mean over all positions
-BILINEAR_NOISE = 4 / 9
 LINEAR_NOISE_FLOOR = 1e-4  # sr^-1; for linear files, whose noise is unknown
 
 
@@ -89,16 +87,6 @@ class ViewLevels:
     highest: Float64  # value of the longest exposure
     clipped: Mask  # whether the picture is cut off at its highest value
 
-    @classmethod
-    def empty(cls, shape: tuple[int, ...]) -> ViewLevels:
-        """Levels before any view was read."""
-        return cls(
-            np.full(shape, np.nan),
-            np.zeros(shape),
-            np.full(shape, np.nan),
-            np.zeros(shape, bool),
-        )
-
 
 @dataclass(frozen=True)
 class Lumitexels:
@@ -110,7 +98,6 @@ class Lumitexels:
     view_count: Index  # (light, camera) samples of each view
     views: ViewLevels
     noise_floor: float  # sr^-1
-    shot_noise: float  # sr^-1
     photographs: Mapping[tuple[int, int], Image]
     calibration: Calibration | None = None  # None: not checked
     noise: SampleNoise | None = None  # None: the electrons of a camera are unknown
@@ -173,11 +160,24 @@ class Sampler:
     faults: list[Fault] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self._levels = ViewLevels.empty(self.spool.done.shape)
+        unknown = np.full((2, *self.spool.done.shape), np.nan)
+        none = np.zeros(self.spool.done.shape)
+        self._levels = ViewLevels(unknown[0], none, unknown[1], none > 0)
         self._sampled = self.spool.done.copy()  # or found to be faulty
         self._patterns = SensorPatterns(self.check.dome, self.mergers)
-        cameras = range(len(self.check.dome.cameras))
-        self._shots = list(self.pool.map(self._camera_sampling, cameras))
+        surfels = self.check.surfels
+        frontal = self.pool.map(
+            lambda camera: _frontal(camera, surfels), self.check.dome.cameras
+        )
+        self._shots = [
+            CameraSampling(clear & steep, np.ascontiguousarray(pixels))
+            for clear, pixels, steep in zip(
+                self.check.clear.T,
+                self.check.pixels.transpose(1, 0, 2),
+                frontal,
+                strict=True,
+            )
+        ]
 
     def pictures(self, pairs: Collection[Pair]) -> dict[Pair, Float32]:
         """Downsampled photographs of these views, which are sampled unless they are in
@@ -256,7 +256,6 @@ class Sampler:
             view_count=self.spool.views,
             views=self._levels,
             noise_floor=noise_floor(check.dome, check.intensity, check.surfels),
-            shot_noise=shot_noise(check.dome, check.intensity, check.surfels),
             photographs=self._kept(self.kept, _photograph_name),
             calibration=calibration,
             noise=sample_noise(check.dome, check.pixels, pixels.T),
@@ -328,12 +327,6 @@ class Sampler:
         )
         return out, outcome
 
-    def _camera_sampling(self, c: int) -> CameraSampling:
-        check = self.check
-        camera = check.dome.cameras[c]
-        surfels = check.clear[:, c] & _frontal(camera, check.surfels)
-        return CameraSampling(surfels, np.ascontiguousarray(check.pixels[:, c]))
-
 
 def _photograph_name(pair: Pair) -> str:
     return "photograph-{}-{}".format(*pair)
@@ -362,34 +355,10 @@ def noise_floor(dome: DomeRecord, intensity: Float64, surfels: SurfelSet) -> flo
     light and distance.
     """
     floors = [radiance_floor(camera.sensor, dome.exposures) for camera in dome.cameras]
-    per_radiance = _reflectance_per_radiance(dome, intensity, surfels)
-    return float(np.median(floors)) * per_radiance or LINEAR_NOISE_FLOOR
-
-
-def shot_noise(dome: DomeRecord, intensity: Float64, surfels: SurfelSet) -> float:
-    """Variance by photons over reflectance [sr^-1], at the median light and distance; 0
-    if electrons are not known.
-
-    For radiance L, the sensor counts L times the sum of the exposure times times the
-    electrons of full exposure: the variance of merged radiance is L over this number
-    per unit of radiance.
-    """
-    sensors = [camera.sensor for camera in dome.cameras]
-    if not all(sensor.noise_known for sensor in sensors):
-        return 0.0
-    electrons = float(np.median([sensor.full_electrons for sensor in sensors]))
-    per_second = 1 / (electrons * sum(dome.exposures.values()))
-    per_radiance = _reflectance_per_radiance(dome, intensity, surfels)
-    return BILINEAR_NOISE * per_second * per_radiance
-
-
-def _reflectance_per_radiance(
-    dome: DomeRecord, intensity: Float64, surfels: SurfelSet
-) -> float:
-    """Reflectance per radiance at the median light and distance."""
     middle = surfels.position.mean(axis=0)[None]
     square = np.array([light_falloff(light, middle)[0][0] for light in dome.lights])
-    return float(np.median(square[:, None] / intensity))
+    per_radiance = float(np.median(square[:, None] / intensity))
+    return float(np.median(floors)) * per_radiance or LINEAR_NOISE_FLOOR
 
 
 def choose_photographs(dome: DomeRecord, middle: Float64, count: int) -> list[Pair]:
@@ -398,13 +367,10 @@ def choose_photographs(dome: DomeRecord, middle: Float64, count: int) -> list[Pa
     """
     if count < 1:
         return []
-
-    def directions(positions: list[Float64]) -> Float64:
-        way = np.array(positions) - middle
-        return unit(way)
-
-    camera = directions([camera.centre for camera in dome.cameras])[:, 2].argmax()
-    direction = directions([light.position for light in dome.lights])
+    centres = np.array([camera.centre for camera in dome.cameras])
+    places = np.array([light.position for light in dome.lights])
+    camera = int(unit(centres - middle)[:, 2].argmax())
+    direction = unit(places - middle)
     front = np.flatnonzero(direction[:, 2] > 0.5)
     if len(front) < count:
         front = np.argsort(-direction[:, 2])[:count]
@@ -413,7 +379,7 @@ def choose_photographs(dome: DomeRecord, middle: Float64, count: int) -> list[Pa
     while len(chosen) < min(count, len(front)):
         nearest = (direction[front] @ direction[chosen].T).max(axis=1)
         chosen.append(int(front[nearest.argmin()]))
-    return [(light, int(camera)) for light in sorted(chosen)]
+    return [(light, camera) for light in sorted(chosen)]
 
 
 def _frontal(camera: CameraRecord, surfels: SurfelSet) -> Mask:
@@ -459,18 +425,12 @@ def sample_noise(
     seconds = np.sort(np.fromiter(dome.exposures.values(), float))[::-1]
     parts = []
     for c, camera in enumerate(dome.cameras):
-        seen = np.isfinite(effective_pixels[:, c])
-        parts.append(
-            radiance_noise(camera, seconds, _mean_gain(camera, pixels[seen, c]))
-        )
+        seen = pixels[np.isfinite(effective_pixels[:, c]), c]
+        gain = 1.0
+        if camera.vignette.any() and len(seen):
+            size = (camera.width, camera.height)
+            column, row = np.clip(seen.astype(int), 0, np.array(size) - 1).T
+            gain = float(vignette_gain(camera)[row, column, 0].mean())
+        parts.append(radiance_noise(camera, seconds, gain))
     limit, read, shot = (np.stack(part) for part in zip(*parts, strict=True))
     return SampleNoise(limit, read, shot, effective_pixels)
-
-
-def _mean_gain(camera: CameraRecord, pixels: Float32) -> float:
-    """Mean vignette at projections (n, 2)."""
-    if not camera.vignette.any() or not len(pixels):
-        return 1.0
-    column = np.clip(pixels[:, 0].astype(int), 0, camera.width - 1)
-    row = np.clip(pixels[:, 1].astype(int), 0, camera.height - 1)
-    return float(vignette_gain(camera)[row, column, 0].mean())

@@ -31,11 +31,6 @@ NOISE_FLOOR = declare(
     "reflectance of one standard deviation of read noise and quantisation, at the "
     "median light and distance",
 )
-SHOT_NOISE = declare(
-    "float64 samples/shot_noise() [sr-1]",
-    "variance by photons over reflectance, at the median light and distance, where the "
-    "longest exposure is not saturated; 0 if electrons are not known",
-)
 EFFECTIVE_PIXELS = declare(
     "float16 samples/effective_pixels(surfel, camera) [1]",
     "number of equally weighted pixels whose mean is as noisy as a sample; NaN where "
