@@ -88,9 +88,7 @@ def _octave_biases(merged, truth, longest):
 
 
 def light_errors(capture, truth):
-    """Relative errors of the intensities from `light_intensities` and from `fit_light`,
-    and the fitted fall-off.
-    """
+    """Relative errors of the intensities from `light_intensities` and from `fit_light`."""
     dome = capture.dome
     faults = []
     mergers = frame_mergers(dome, faults)
@@ -117,13 +115,9 @@ def light_errors(capture, truth):
             white.normal,
             white.reflectance,
         )
-        fits.append(fit_light(pixels))
+        fits.append(fit_light(pixels, falloff=light.falloff))
     fit_errors = np.array([f.intensity for f in fits]) / truth["light_intensity"] - 1
-    return (
-        target_errors,
-        fit_errors,
-        np.median([[f.falloff, f.falloff_error] for f in fits], axis=0),
-    )
+    return target_errors, fit_errors
 
 
 def _target_radiance(dome, light, merger, target):
@@ -166,21 +160,20 @@ def print_captures(captures: Sequence[Path]) -> None:
     """Print a row for each capture, and biases of radiance where responses are curved."""
     print(
         "| capture | largest error of `light_intensities` | of `fit_light` "
-        "| fitted fall-off | `calibrate_lights`: mean error, largest error, glare, rms z |"
+        "| `calibrate_lights`: mean error, largest error, glare, rms z |"
     )
-    print("|---" * 5 + "|")
+    print("|---" * 4 + "|")
     curved = {}
     for folder in captures:
         capture = read_capture(folder)
         truth = read_truth(folder)
-        target_errors, fit_errors, falloff = light_errors(capture, truth)
+        target_errors, fit_errors = light_errors(capture, truth)
         frames = folder.with_name(f"{folder.name}.truth")
         if capture.dome.cameras[0].sensor.response is not None and frames.is_dir():
             curved[folder.name] = radiance_biases(capture, frames)
         cells = [
             folder.name,
             *(f"{100 * np.abs(e).max():.2f} %" for e in (target_errors, fit_errors)),
-            f"{falloff[0]:.2f} ± {falloff[1]:.2f}",
             "{:.2f} %, {:.2f} %, {:.2f} %, {:.2f}".format(
                 *stated_errors(capture, truth)
             ),

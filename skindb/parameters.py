@@ -596,7 +596,6 @@ class CalibrationParameters(Limited):
     """Parameters of a calibration of the lights, cameras and probe of a laboratory."""
 
     name: str = option(MISSING, "Name by which captures refer to the calibration.")
-    fit_falloff: bool = option(False, "Also fit the angular fall-off of every light.")
     position_error: float = option(
         POSITION_ERROR_MM,
         "Standard error of the positions of the lights relative to the white target "

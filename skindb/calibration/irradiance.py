@@ -244,18 +244,12 @@ class TargetPixels:
 
 @dataclass(frozen=True)
 class LightFit:
-    """Radiant intensity (3,) along the axis in radiance mm2, and exponent of the
-    fall-off cos^exponent.
-
-    The errors are standard errors; that of the exponent is part of those of the
-    intensity. `used` is the fraction of the usable pixels that are neither shadowed nor
-    dirty.
+    """Radiant intensity (3,) along the axis in radiance mm2, its standard error, and the
+    fraction of the usable pixels that are neither shadowed nor dirty.
     """
 
     intensity: Float64
     intensity_error: Float64
-    falloff: float
-    falloff_error: float
     used: float
 
 
@@ -292,22 +286,19 @@ def _light_geometry(
     return distance, -(way @ target.normal) / distance, (way @ target.axis) / distance
 
 
-def fit_light(target: TargetPixels, *, falloff: float | None = None) -> LightFit:
-    """Intensity of a light, and its fall-off unless that is given, from ln(pi L d^2 /
-    (reflectance cos)).
+def fit_light(target: TargetPixels, *, falloff: float) -> LightFit:
+    """Intensity of a light from ln(pi L d^2 / (reflectance cos cos(angle to the
+    axis)^falloff)).
 
-    The logarithm is linear in ln intensity and in the exponent times ln cos(angle to
-    the axis). The fit is by least squares over the three channels with a common
-    exponent; deviating pixels are excluded in rounds, which start from the median, so
-    that less than half of the target may lie in shadow.
+    Deviating pixels are excluded in rounds, which start from the median, so that less
+    than half of the target may lie in shadow.
 
     Parameters
     ----------
     target
         Radiance and geometry.
     falloff
-        The exponent, if it is known. A target that covers a small angle as seen from
-        the light determines it poorly.
+        Exponent of the angular fall-off.
 
     Raises
     ------
@@ -316,9 +307,8 @@ def fit_light(target: TargetPixels, *, falloff: float | None = None) -> LightFit
     """
     distance, lit, angle = _light_geometry(target, target.position)
     with np.errstate(invalid="ignore", divide="ignore"):
-        factor = distance**2 / (target.reflectance * lit)
+        factor = distance**2 / (target.reflectance * lit * angle**falloff)
         value = np.log(np.pi * target.radiance * factor[:, None])
-        slope = np.log(angle)
     good = (lit > MIN_COSINE) & (angle > MIN_COSINE) & finite_rows(value)
     require(
         good.sum() >= MIN_PIXELS,
@@ -327,60 +317,26 @@ def fit_light(target: TargetPixels, *, falloff: float | None = None) -> LightFit
         f"{int(good.sum())} of {len(good)}",
         "add a suitable exposure",
     )
-    return _fit(value[good], slope[good], falloff)
-
-
-def _fit(value: Float64, slope: Float64, falloff: float | None) -> LightFit:
-    """Robust fit of logarithms (n, 3) over ln cosine (n,)."""
-    level, exponent, inliers = _robust_line(value, slope, falloff)
-    inlier_fraction = float(inliers.mean())
-    require(
-        inlier_fraction >= MIN_USED,
-        "white target",
-        "less than half of the white target may lie in shadow",
-        f"{inlier_fraction:.0%} agree",
-        "move the target, or remove the obstacle",
-    )
-    residual = value[inliers] - level - exponent * slope[inliers, None]
-    exponent_error = 0.0
-    if falloff is None:
-        centred = slope[inliers] - slope[inliers].mean()
-        common = float(residual.mean(axis=1).std(ddof=2))
-        exponent_error = common / np.sqrt(max(float(centred @ centred), 1e-12))
-    error = np.hypot(
-        residual.std(axis=0, ddof=1) / np.sqrt(len(residual)),
-        exponent_error * slope[inliers].mean(),
-    )
-    intensity = np.exp(level)
-    return LightFit(
-        intensity,
-        intensity * error,
-        exponent,
-        float(exponent_error),
-        inlier_fraction,
-    )
-
-
-def _robust_line(
-    value: Float64, slope: Float64, falloff: float | None
-) -> tuple[Float64, float, Mask]:
-    """Level (3,) and exponent of logarithms (n, 3) over ln cosine (n,), and the pixels
-    (n,) that are not outliers.
-    """
+    value = value[good]
     inliers = np.ones(len(value), bool)
-    exponent = falloff or 0.0
-    level = np.median(value - exponent * slope[:, None], axis=0)
+    level = np.median(value, axis=0)
     for _ in range(ROUNDS):
-        apart = (value - level - exponent * slope[:, None]).mean(axis=1)
+        apart = (value - level).mean(axis=1)
         spread = float(robust_deviation(apart - np.median(apart)))
         limit = MAX_DEVIATIONS * max(spread, 1e-9)
         chosen = np.abs(apart - np.median(apart[inliers])) <= limit
-        centred = slope[chosen] - slope[chosen].mean()
-        square = max(float(centred @ centred), 1e-12)
-        if falloff is None:
-            exponent = float(centred @ value[chosen].mean(axis=1)) / square
-        level = value[chosen].mean(axis=0) - exponent * slope[chosen].mean()
+        level = value[chosen].mean(axis=0)
         if (chosen == inliers).all():
             break
         inliers = chosen
-    return level, exponent, inliers
+    used = float(inliers.mean())
+    require(
+        used >= MIN_USED,
+        "white target",
+        "less than half of the white target may lie in shadow",
+        f"{used:.0%} agree",
+        "move the target, or remove the obstacle",
+    )
+    intensity = np.exp(level)
+    error = value[inliers].std(axis=0, ddof=1) / np.sqrt(inliers.sum())
+    return LightFit(intensity, intensity * error, used)

@@ -308,12 +308,9 @@ def light_position(origins: ArrayLike, directions: ArrayLike) -> LightPosition:
 
 
 def calibrate_lights(
-    dome: DomeRecord,
-    *,
-    fit_falloff: bool = False,
-    position_error: float = POSITION_ERROR_MM,
+    dome: DomeRecord, *, position_error: float = POSITION_ERROR_MM
 ) -> xr.Dataset:
-    """Radiant intensity of every light, and perhaps its fall-off, with standard errors.
+    """Radiant intensity of every light, with standard errors.
 
     The systematic error of an intensity is that of the position of the light relative
     to the target, and glare: the light that the pictures show beside the target. If the
@@ -325,10 +322,6 @@ def calibrate_lights(
     ----------
     dome
         From `read_setup_dome`.
-    fit_falloff
-        Also fit the exponents of the angular fall-off, instead of using those of
-        dome.json. A target that covers a small angle as seen from the light determines
-        them poorly.
     position_error
         Standard error of the position of a light relative to the target along each axis, in mm.
 
@@ -361,8 +354,8 @@ def calibrate_lights(
         target over that on the target.
         """
         pixels, beside = _pixels(dome, white, light, views)
-        fit = fit_light(pixels, falloff=None if fit_falloff else light.falloff)
-        sensitivity = position_sensitivity(pixels, falloff=fit.falloff)
+        fit = fit_light(pixels, falloff=light.falloff)
+        sensitivity = position_sensitivity(pixels, falloff=light.falloff)
         return fit, position_error * sensitivity, beside
 
     with ThreadPoolExecutor(THREADS) as pool:
@@ -380,8 +373,7 @@ def calibrate_lights(
             "calibrated_intensity_error": [fit.intensity_error for fit in fits],
             "calibrated_intensity_position_error": list(position_errors),
             "glare_fraction": list(glare),
-            "calibrated_falloff": [fit.falloff for fit in fits],
-            "calibrated_falloff_error": [fit.falloff_error for fit in fits],
+            "calibrated_falloff": [light.falloff for light in dome.lights],
             "target_used_fraction": [fit.used for fit in fits],
         },
         coords={

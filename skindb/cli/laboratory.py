@@ -112,8 +112,7 @@ def calibrate(
         default = CalibrationParameters(parameters.name)
         if parameters != default:
             raise click.UsageError(
-                "--fit-falloff and --position-error belong to a SETUP; they have no "
-                "meaning with --from-takes"
+                "--position-error belongs to a SETUP; it has no meaning with --from-takes"
             )
         record = workflow.calibrate_rig(
             database, sources, name=parameters.name, progress=bar()

@@ -265,9 +265,9 @@ def calibrate(
     name
         Name by which captures refer to it.
     **options
-        Of `skindb.parameters.CalibrationParameters`: `fit_falloff`, whether the angular
-        fall-off of every light is fitted too, and `position_error`, the standard error
-        of the position of a light relative to the white target along each axis, in mm.
+        Of `skindb.parameters.CalibrationParameters`: `position_error`, the standard
+        error of the position of a light relative to the white target along each axis,
+        in mm.
 
     Returns
     -------
@@ -295,15 +295,12 @@ def calibrate(
             dome, groups["camera_calibration"], where="the calibrated cameras"
         )
     groups["light_calibration"] = calibrate_lights(
-        dome,
-        fit_falloff=chosen.fit_falloff,
-        position_error=chosen.position_error,
+        dome, position_error=chosen.position_error
     )
     if (flat := read_flat_frames(Path(setup))) is not None:
         groups["probe_calibration"] = calibrate_probe(flat)
     parameters = {
         "setup": Path(setup).name,
-        "fit_falloff": chosen.fit_falloff,
         "position_error": chosen.position_error,
     }
     provenance = {

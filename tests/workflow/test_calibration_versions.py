@@ -51,24 +51,18 @@ def setup(pristine, tmp_path):
     return folder
 
 
-@pytest.mark.parametrize("fit_falloff", [False, True])
-def test_calibrate__intensities_of_the_made_up_lights(setup, tmp_path, fit_falloff):
+def test_calibrate__intensities_of_the_made_up_lights(setup, tmp_path):
     db = skindb.open(str(tmp_path / "db"))
-    record = workflow.calibrate(db, setup, name="dome-a", fit_falloff=fit_falloff)
+    record = workflow.calibrate(db, setup, name="dome-a")
     found = db.read("calibration", "dome-a")["light_calibration"].to_dataset().load()
     assert found["light"].values.tolist() == list(LIGHTS)
     z = (found["calibrated_intensity"] - INTENSITY) / found[
         "calibrated_intensity_error"
     ]
     assert np.abs(z).max() < 4  # of 12 numbers
-    # noise of a frame alone: a per mille with the given fall-off
-    assert (found["calibrated_intensity_error"] / INTENSITY).max() < (
-        0.05 if fit_falloff else 0.002
-    )
-    assert (
-        np.abs(found["calibrated_falloff"])
-        < 4 * found["calibrated_falloff_error"] + 1e-9
-    ).all()
+    # noise of a frame alone: a per mille
+    assert (found["calibrated_intensity_error"] / INTENSITY).max() < 0.002
+    assert (found["calibrated_falloff"] == 0).all()
     assert workflow.describe_calibration(db, record)["lights"] == len(LIGHTS)
 
 

@@ -378,7 +378,9 @@ def test_calibrate_command(rig):
     assert "  directions are moved by 0." in output
     assert "from 4 takes" in run("--from-takes", "S0", "S1", "S2", "S3", "--name", "b")
     assert "at least 3 takes" in run("--from-takes", "S0", "--name", "dome")
-    assert "belong to a SETUP" in run("--from-takes", "--fit-falloff", "--name", "dome")
+    assert "belongs to a SETUP" in run(
+        "--from-takes", "--position-error", "2", "--name", "dome"
+    )
     assert "give one SETUP, or --from-takes" in run("--name", "dome")
     assert "all versions must be from takes, or all from set-ups" in run(
         str(rig.folder / "S0"), "--name", "dome"
