@@ -84,14 +84,14 @@ def _row_buffers(exposures: int, size: int, zero: float) -> RowBuffers:
 
 @kernel
 def develop(
-    frames: tuple[Values, ...],
+    frames: tuple[Values, ...] | Values,
     model: ExposureModel,
     spans: IntMatrix,
     radiance: Cube32,
     flag: ByteMatrix,
-    usable: ByteMatrix,
+    error: Cube32,
 ) -> None:
-    """Merge the exposures of one view to radiance with the formulas of
+    """Merge the exposures of one view to radiance; see
     `skindb.calibration.radiance.merge_exposures`.
 
     The picture is processed row by row, so that intermediate values stay in the cache.
@@ -101,7 +101,7 @@ def develop(
     Parameters
     ----------
     frames
-        One array (h, w, 3) of uint8 or uint16 per exposure.
+        One array (h, w, 3) of uint8 or uint16 per exposure, or one array of them.
     model
         Levels, response and noise.
     spans
@@ -111,8 +111,9 @@ def develop(
         every exposure.
     flag
         (h, w) uint8 output; SATURATED outside the spans, where no sample uses the pixel.
-    usable
-        (h, w) uint8 zeros, output: see `skindb.calibration.radiance.FrameMerger.merge`; or (0, 0).
+    error
+        (h, w, 3) float32 output within the spans: standard error of the radiance without
+        colour matrix; or (0, 0, 0).
     """
     height, width = flag.shape
     row = _row_buffers(len(frames), 3 * width, model.zero)
@@ -124,13 +125,15 @@ def develop(
         size = 3 * (end - start)
         if size == 0:
             continue
-        _sum_exposures(frames, y, start, end, model, row, usable)
+        _sum_exposures(frames, y, start, end, model, row)
         total = row.total[:size]
         for k in range(size):
             expected = total[k] / row.time[k]
             positive = expected if expected > ZERO else ZERO
             total[k] = np.float32(model.photon) * positive
         _average(row.signal, row.noise, model.seconds, total, row.weights[:size])
+        if error.shape[0]:
+            _write_errors(row.weights[:size], model.gain, y, start, error)
         _finish(y, start, total, row.time, row.above, model, radiance, flag)
 
 
@@ -160,13 +163,12 @@ def develop_linear(
 
 @kernel
 def _sum_exposures(
-    frames: tuple[Values, ...],
+    frames: tuple[Values, ...] | Values,
     y: int,
     start: int,
     end: int,
     model: ExposureModel,
     row: RowBuffers,
-    usable: ByteMatrix,
 ) -> None:
     """Write the relative exposures of a part of a row, and their sums."""
     white = np.float32(model.white)
@@ -186,8 +188,6 @@ def _sum_exposures(
         exposure = row.signal[e, :size]
         spread = row.noise[e, :size]
         _relative_exposure(value, dark, row.black, model, exposure, spread)
-        if usable.shape[0]:
-            _count(value, white, exposure, spread, usable[y, start:end])
         _collect(
             value,
             white,
@@ -246,22 +246,6 @@ def _tabulated_response(
 
 
 @kernel
-def _count(
-    value: Values, white: Real, signal: Vector32, noise: Vector32, usable: ByteVector
-) -> None:
-    """Count the exposure at pixels where a channel is above the noise and none is at
-    the white level.
-    """
-    for x in range(usable.shape[0]):
-        lit = 0
-        white_channels = 0
-        for k in range(3 * x, 3 * x + 3):
-            lit += 1 if signal[k] > DARK_SIGMA * np.sqrt(noise[k]) else 0
-            white_channels += 0 if np.float32(value[k]) < white else 1
-        usable[x] += np.uint8(lit > 0 and white_channels == 0)
-
-
-@kernel
 def _collect(
     value: Values,
     white: Real,
@@ -310,6 +294,17 @@ def _average(
             weights[k] += weight * second
     for k in range(weights.shape[0]):
         photons[k] = mean[k] / weights[k]
+
+
+@kernel
+def _write_errors(
+    weights: Vector32, gain: Matrix32, y: int, start: int, out: Cube32
+) -> None:
+    """Write the standard errors of a part of a row from its sums of weights."""
+    for k in range(weights.shape[0]):
+        x = start + k // 3
+        scale = gain[0, 0] if gain.shape[0] == 1 else gain[y, x]
+        out[y, x, k % 3] = scale / np.sqrt(weights[k])
 
 
 @kernel

@@ -319,13 +319,13 @@ def _flat(
     sensor = replace(
         sensor, electrons_per_dn=noise.electrons_per_dn, read_noise=noise.read_noise
     )
-    means = []
+    equal = []
     for repeats in sets:
-        mean = np.mean(repeats, axis=0).astype(np.float32)
-        # a mean hides that one of them was saturated
-        mean[np.max(repeats, axis=0) >= sensor.white] = sensor.white
-        means.append(mean)
-    merged, _, flag = merge_exposures(means, tuple(frames.exposures.values()), sensor)
+        # noise decides which of equal frames is saturated
+        highest = np.max(repeats, axis=0)
+        equal += [np.where(highest < sensor.white, x, highest) for x in repeats]
+    seconds = np.repeat([*frames.exposures.values()], kind.repeats)
+    merged, _, flag = merge_exposures(equal, seconds.tolist(), sensor)
     shade = fit_vignette(
         np.where(flag == OK, merged[..., GREEN], np.nan), camera.K[:2, 2]
     )

@@ -104,9 +104,14 @@ def view_faults(
         thinned = [_thinned(frame) for frame in frames]
         dark = None if merger.dark is None else [_thinned(x) for x in merger.dark]
         exposures = compared_exposures(seconds, thinned, sensor, dark=dark)
-        fault = _saturated_fault(place, exposures, sensor) or _below_fault(
-            place, exposures, sensor, dark=dark is not None
-        )
+        fault = _below_fault(place, exposures, sensor, dark=dark is not None)
+        if min(exposure.frame.min() for exposure in exposures) >= sensor.white:
+            fault = Fault(
+                place,
+                "a photograph must not be saturated everywhere",
+                "no value below white_level",
+                "take it with a shorter exposure",
+            )
         if fault is None:
             view += "exposure "
             fault = disagreement(place, exposures, sensor)
@@ -221,20 +226,6 @@ def _radiance_ratio(
     apart = np.abs(by_short_values - by_long_values) > limit
     ratio = np.median(by_short_values / np.maximum(by_long_values, 1e-9))
     return float(ratio), float(apart.mean())
-
-
-def _saturated_fault(
-    place: str, exposures: Sequence[ComparedExposure], sensor: SensorRecord
-) -> Fault | None:
-    """Fault of a picture that is at the white level everywhere, in every exposure."""
-    if all(exposure.frame.min() >= sensor.white for exposure in exposures):
-        return Fault(
-            place,
-            "a photograph must not be saturated everywhere",
-            "no value below white_level",
-            "take it with a shorter exposure",
-        )
-    return None
 
 
 def _below_fault(
@@ -356,7 +347,7 @@ def dark_faults(dome: DomeRecord, merger: FrameMerger) -> list[Fault]:
     """
     faults = []
     black = merger.camera.sensor.black
-    for name, (frame, offset) in _dark_offsets(dome, merger).items():
+    for name, frame, offset in _dark_offsets(dome, merger):
         exposure = (
             f"exposure {name} of camera {merger.camera.id}, black_level {black:g}"
         )
@@ -382,7 +373,7 @@ def dark_faults(dome: DomeRecord, merger: FrameMerger) -> list[Fault]:
 
 def dark_notes(dome: DomeRecord, merger: FrameMerger) -> list[str]:
     """Warnings about dark frames that differ noticeably from the black level."""
-    offsets = [offset for _, offset in _dark_offsets(dome, merger).values()]
+    offsets = [offset for _, _, offset in _dark_offsets(dome, merger)]
     worst = max(offsets, key=abs, default=0.0)
     if abs(worst) <= NOTED_DARK_OFFSET:
         return []
@@ -410,33 +401,27 @@ def repeated_frame_faults(
     alike = dict[str, list[Path]]()
     for path in sorted(digests.keys() - set(besides)):
         alike.setdefault(digests[path], []).append(path)
-    faults = []
-    for paths in alike.values():
-        if len(paths) > 1 and np.ptp(read_frame(paths[0])) > 0:
-            copy, original = (path.relative_to(folder) for path in paths[:2])
-            faults.append(
-                Fault(
-                    str(folder),
-                    "every frame must have been taken by itself",
-                    f"{copy} is a copy of {original}",
-                    "copy the right frames from the camera again",
-                )
-            )
-    return faults
+    return [
+        Fault(
+            str(folder),
+            "every frame must have been taken by itself",
+            f"{paths[0].relative_to(folder)} is a copy of {paths[1].relative_to(folder)}",
+            "copy the right frames from the camera again",
+        )
+        for paths in alike.values()
+        if len(paths) > 1 and np.ptp(read_frame(paths[0])) > 0
+    ]
 
 
 def _dark_offsets(
     dome: DomeRecord, merger: FrameMerger
-) -> dict[str, tuple[Frame, float]]:
+) -> Iterator[tuple[str, Frame, float]]:
     """Each dark frame, and its median above the black level, relative to the range of values."""
-    if merger.dark is None:
-        return {}
     sensor = merger.camera.sensor
-    span = sensor.white - sensor.black
-    return {
-        name: (frame, float(np.median(_thinned(frame)) - sensor.black) / span)
-        for name, frame in zip(dome.exposures, merger.dark, strict=True)
-    }
+    darks = () if merger.dark is None else merger.dark
+    for name, frame in zip(dome.exposures, darks, strict=False):
+        above = float(np.median(_thinned(frame)) - sensor.black)
+        yield name, frame, above / (sensor.white - sensor.black)
 
 
 def _thinned(frame: Frame) -> Frame:

@@ -5,15 +5,10 @@ colour (format, dome.json).
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import NamedTuple
 
 import numpy as np
 
 from skindb.calibration._merge_kernels import (
-    DARK,
-    DARK_SIGMA,
-    OK,
-    SATURATED,
     ExposureModel,
     develop,
     develop_linear,
@@ -23,11 +18,12 @@ from skindb.format.dome import CameraRecord, DomeRecord
 from skindb.format.frames import Digests, Frame, filled, read_frames
 from skindb.format.sensor import SensorRecord
 from skindb.jit import sample_bits
-from skindb.types import Bytes, Float32, Float64, Index, Mask, finite_rows, float64
+from skindb.types import Bytes, Float32, Float64, Index, float64
 
 # number of radiances up to the white level at which the linear model is fitted to the
 # variance
 RADIANCES = 64
+NO_ERROR = np.empty((0, 0, 0), np.float32)
 
 Image = Float32
 
@@ -41,68 +37,36 @@ class FrameMerger:
     dark: Frame | None = None  # (exposure, h, w, 3) mean dark frames
 
     def merge(
-        self,
-        frames: list[Frame],
-        spans: Index | None = None,
-        *,
-        usable: Bytes | None = None,
+        self, frames: list[Frame], spans: Index | None = None
     ) -> tuple[Image, Bytes]:
-        """Radiance (h, w, 3) and flags (h, w) of the exposures of one view, by the
-        compiled `merge_exposures`.
+        """Radiance (h, w, 3) and flags (h, w) of the exposures of one view, as of
+        `merge_exposures`.
 
         `spans` (h, 2) are the first wanted column of each row and the one after the
-        last, by default all; pixels outside may be NaN and SATURATED. `usable` (h, w),
-        zeros, receives the number of exposures in which no channel is at the white
-        level and one is above the dark level; two for linear files, whose exposures are
-        unknown. A pixel with one such exposure has no second value that could confirm
-        its radiance; one with none is saturated, dark, or lies in a gap between the
-        exposures.
+        last, by default all; pixels outside may be NaN and SATURATED.
         """
         height, width, _ = frames[0].shape
         radiance = np.empty((height, width, 3), np.float32)
         flag = np.empty((height, width), np.uint8)
         if spans is None:
-            spans = np.tile(np.array([0, width]), (height, 1))
+            spans = _whole_rows(radiance)
         if self.camera.sensor.kind.bits == 0:
             develop_linear(sample_bits(_only(frames)), spans, radiance, flag)
             if set(self.camera.gain) != {1.0}:
                 with np.errstate(all="ignore"):  # outside the spans is any value
                     radiance /= np.array(self.camera.gain, np.float32)
-            if usable is not None:
-                usable[:] = 2
-            return radiance, flag
-        count = np.empty((0, 0), np.uint8) if usable is None else usable
-        develop(tuple(frames), self._exposure_model, spans, radiance, flag, count)
+        else:
+            develop(tuple(frames), self._model, spans, radiance, flag, NO_ERROR)
         return radiance, flag
 
     @cached_property
-    def _exposure_model(self) -> ExposureModel:
-        sensor = self.camera.sensor
-        matrix = self.camera.colour_matrix / np.array(self.camera.gain)[:, None]
-        dark = np.zeros((0, 1, 1, 3), sensor.kind.dtype)
-        if self.dark is not None:
-            dark = np.ascontiguousarray(self.dark)
-        curve, offset = _curve(sensor, dark=self.dark is not None)
-        span = sensor.white - sensor.black
-        slope = np.asarray([1 / np.float32(span)], np.float32)
-        longest = max(self.seconds)
+    def _model(self) -> ExposureModel:
+        camera = self.camera
         shade = np.ones((1, 1))
-        if self.camera.vignette.any():
-            shade = vignette_gain(self.camera)[..., 0].astype(float)
-        colours = matrix if (matrix != np.eye(3)).any() else np.zeros((0, 3))
-        return ExposureModel(
-            dark=dark,
-            curve=curve,
-            offset=offset,
-            zero=float(np.float32(sensor.black)),
-            span=float(span),
-            variance=float(read_sigma(slope, sensor)[0]) ** 2,
-            white=float(sensor.white),
-            seconds=np.asarray(self.seconds, np.float32) / np.float32(longest),
-            photon=1 / sensor.full_electrons,
-            gain=(1 / shade / longest).astype(np.float32),
-            matrix=np.ascontiguousarray(colours, np.float32),
-        )
+        if camera.vignette.any():
+            shade = vignette_gain(camera)[..., 0].astype(float)
+        matrix = camera.colour_matrix / np.array(camera.gain)[:, None]
+        return _exposure_model(camera.sensor, self.seconds, self.dark, shade, matrix)
 
 
 def _curve(sensor: SensorRecord, *, dark: bool) -> tuple[Image, int]:
@@ -179,11 +143,11 @@ def vignette_gain(camera: CameraRecord) -> Image:
 
 
 def merge_exposures(
-    frames: list[Frame],
-    seconds: tuple[float, ...],
+    frames: Sequence[Frame],
+    seconds: Sequence[float],
     sensor: SensorRecord,
     *,
-    dark: Sequence[Frame] | Frame | None = None,
+    dark: Frame | None = None,
     vignette: Image | None = None,
 ) -> tuple[Image, Image, Bytes]:
     """Merge several exposures to one radiance, each weighted by its inverse variance.
@@ -201,7 +165,7 @@ def merge_exposures(
     sensor
         Levels, noise and response.
     dark
-        Mean dark frame per exposure; default `sensor.black`.
+        (exposure, h, w, 3) mean dark frames; default `sensor.black`.
     vignette
         (h, w, 1) gain of the lens; default 1.
 
@@ -215,61 +179,54 @@ def merge_exposures(
         (h, w) OK, SATURATED (a channel in every exposure) or DARK (all channels at most
         black + 2 sigma in every exposure).
     """
+    radiance, error = np.zeros((2, *frames[0].shape), np.float32)
+    flag = np.empty(radiance.shape[:2], np.uint8)
+    spans = _whole_rows(radiance)
     if sensor.kind.bits == 0:
-        return _linear(frames)
-    shape = frames[0].shape
-    # times are relative to it: their squares stay within single precision
-    longest = np.float32(max(seconds))
-    exposures = []
-    is_dark = np.ones(shape[:2], bool)
-    total = np.zeros(shape, np.float32)
-    time = np.zeros(shape, np.float32)
-    for i, frame in enumerate(frames):
-        black = None if dark is None else dark[i]
-        signal, slope = relative_exposure(frame, black, sensor)
-        sigma = read_sigma(slope, sensor)
-        usable = frame < sensor.white
-        is_dark &= (signal <= DARK_SIGMA * sigma).all(axis=-1)
-        relative_seconds = np.float32(seconds[i] / max(seconds))
-        exposure = _Exposure(
-            np.where(usable, signal, 0), sigma, usable, relative_seconds
-        )
-        exposures.append(exposure)
-        total += exposure.signal
-        time += usable * relative_seconds
-    with np.errstate(invalid="ignore", divide="ignore"):
-        expected = np.maximum(total / time, 0)
-        radiance, error = _weighted_mean(exposures, expected, sensor)
-    saturated = np.any(time == 0, axis=-1)
-    flag = np.where(saturated, SATURATED, np.where(is_dark, DARK, OK))
-    gain = longest if vignette is None else vignette * longest
-    return radiance / gain, error / gain, flag.astype(np.uint8)
+        develop_linear(sample_bits(_only(frames)), spans, radiance, flag)
+        return radiance, error, flag
+    shade = np.ones((1, 1)) if vignette is None else vignette[..., 0].astype(float)
+    model = _exposure_model(sensor, seconds, dark, shade, np.eye(3))
+    # one array: the kernel is compiled for each number of arrays
+    develop(np.stack(frames), model, spans, radiance, flag, error)
+    return radiance, error, flag
 
 
-class _Exposure(NamedTuple):
-    """One exposure of a view, in relative units."""
-
-    signal: Image  # (h, w, 3) relative exposure, 0 where it is not usable
-    sigma: Image  # (h, w, 3) of the read noise
-    usable: Mask  # (h, w, 3)
-    seconds: np.float32
+def _whole_rows(picture: Image) -> Index:
+    """Spans (h, 2) of all pixels of a picture (h, w, 3)."""
+    return np.tile(np.array([0, picture.shape[1]]), (picture.shape[0], 1))
 
 
-def _weighted_mean(
-    exposures: Sequence[_Exposure], expected: Image, sensor: SensorRecord
-) -> tuple[Image, Image]:
-    """Mean of the exposures per second, weighted by their inverse variance, and its
-    standard error; `expected` (h, w, 3) is the relative exposure per second.
+def _exposure_model(
+    sensor: SensorRecord,
+    seconds: Sequence[float],
+    dark: Frame | None,
+    shade: Float64,
+    matrix: Float64,
+) -> ExposureModel:
+    """From the values of exposures to radiance, with the gain (h, w) or (1, 1) of the lens
+    and a colour matrix.
     """
-    weighted = np.zeros(expected.shape, np.float32)
-    weights = np.zeros(expected.shape, np.float32)
-    for signal, sigma, usable, seconds in exposures:
-        shot = expected * seconds / np.float32(sensor.full_electrons)
-        variance = np.maximum(shot + sigma**2, np.float32(1e-30))
-        weight = np.where(usable, seconds * seconds / variance, 0)
-        weighted += weight * signal / seconds
-        weights += weight
-    return weighted / weights, np.asarray(1 / np.sqrt(weights), np.float32)
+    curve, offset = _curve(sensor, dark=dark is not None)
+    if dark is None:
+        dark = np.zeros((0, 1, 1, 3), sensor.kind.dtype)
+    span = sensor.white - sensor.black
+    slope = np.asarray([1 / np.float32(span)], np.float32)
+    longest = max(seconds)
+    colours = matrix if (matrix != np.eye(3)).any() else np.zeros((0, 3))
+    return ExposureModel(
+        dark=np.ascontiguousarray(dark),
+        curve=curve,
+        offset=offset,
+        zero=float(np.float32(sensor.black)),
+        span=float(span),
+        variance=float(read_sigma(slope, sensor)[0]) ** 2,
+        white=float(sensor.white),
+        seconds=np.asarray(seconds, np.float32) / np.float32(longest),
+        photon=1 / sensor.full_electrons,
+        gain=(1 / shade / longest).astype(np.float32),
+        matrix=np.ascontiguousarray(colours, np.float32),
+    )
 
 
 def radiance_floor(sensor: SensorRecord, exposures: Mapping[str, float]) -> float:
@@ -282,14 +239,6 @@ def radiance_floor(sensor: SensorRecord, exposures: Mapping[str, float]) -> floa
     _, slope = relative_exposure(black, None, sensor)
     time = np.sqrt(sum(t * t for t in exposures.values()))
     return float(read_sigma(slope, sensor).mean() / time)
-
-
-def _linear(frames: list[Frame]) -> tuple[Image, Image, Bytes]:
-    radiance = _only(frames).astype(np.float32)
-    lost = ~finite_rows(radiance)
-    radiance[lost] = np.nan
-    flag = np.where(lost, SATURATED, OK).astype(np.uint8)
-    return radiance, np.zeros_like(radiance), flag
 
 
 def _only(frames: Sequence[Frame]) -> Frame:

@@ -26,10 +26,7 @@ from skindb.types import (
 )
 
 Halves = np.ndarray[tuple[int, int], np.dtype[np.uint16]]  # bits of half floats
-# outcomes of a sample besides those of a pixel: usable, but no pixel has two exposures;
-# no sample was requested
-SINGLE = 3
-NONE = 4
+NONE = 3  # outcome besides those of a pixel: no sample was requested
 NAN_BITS = np.uint16(0x7E00)  # the half float NaN
 MAX_HALF_FLOAT = 65504.0  # larger numbers are infinite in half precision
 # fraction of dark pixels above which a sample is dark; the rest allows for rounding in
@@ -43,7 +40,6 @@ class MergedView(NamedTuple):
 
     radiance: Cube32  # (h, w, 3)
     flag: ByteMatrix  # (h, w)
-    usable: ByteMatrix  # (h, w) number of usable exposures
 
 
 class PointLight(NamedTuple):
@@ -110,7 +106,7 @@ def gather(
     Parameters
     ----------
     view
-        Radiance, flags and usable exposures.
+        Radiance and flags.
     surfels
         (n,) bool; those to sample. Those that face away from the light get no sample.
     pixels
@@ -122,11 +118,10 @@ def gather(
     out
         (3, n) uint16 output: half floats, NaN where there is no sample.
     outcome
-        (n,) uint8 output: OK, SINGLE (no contributing pixel has two exposures), NONE,
-        SATURATED (a contributing pixel was saturated), DARK (all contributing pixels
-        were dark).
+        (n,) uint8 output: OK, NONE, SATURATED (a contributing pixel was saturated), DARK
+        (all contributing pixels were dark).
     """
-    pixel = np.empty(5)
+    pixel = np.empty(4)
     factor = 1.0 / light.intensity
     out[:] = NAN_BITS
     outcome[:] = NONE
@@ -137,7 +132,7 @@ def gather(
         if scale == 0.0:
             continue
         state = _bilinear(view, pixels[i, 0], pixels[i, 1], pixel)
-        outcome[i] = SINGLE if state == OK and pixel[4] < 2.0 else state
+        outcome[i] = state
         if state == OK:
             for c in range(3):
                 out[c, i] = _half_or_nan(pixel[c] * scale * factor[c])
@@ -187,15 +182,14 @@ def pixel_counts(
 
 @kernel
 def tally(outcome: ByteVector, counts: IntMatrix32) -> int:
-    """Add the outcome of each surfel (n,) to its counts (state, n), SINGLE also to OK;
-    return how many are usable.
+    """Add the outcome of each surfel (n,) to its counts (state, n); return how many are
+    usable.
     """
     usable = 0
     for i in range(outcome.shape[0]):
         if outcome[i] < counts.shape[0]:
             counts[outcome[i], i] += 1
-            counts[OK, i] += outcome[i] == SINGLE
-            usable += outcome[i] == OK or outcome[i] == SINGLE
+            usable += outcome[i] == OK
     return usable
 
 
@@ -213,7 +207,7 @@ def view_levels(
     usable = 0
     too_bright = 0
     for i in range(outcome.shape[0]):
-        if outcome[i] != OK and outcome[i] != SINGLE:
+        if outcome[i] != OK:
             continue
         usable += 1
         above = False
@@ -304,7 +298,6 @@ def _add(view: MergedView, u: int, v: int, weight: float, pixel: Vector) -> int:
     pixel[1] += weight * view.radiance[v, u, 1]
     pixel[2] += weight * view.radiance[v, u, 2]
     pixel[3] += weight if state == DARK else 0.0
-    pixel[4] = max(pixel[4], float(view.usable[v, u]))
     return int(state)
 
 

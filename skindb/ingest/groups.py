@@ -23,7 +23,7 @@ from skindb.types import Float64, Half
 
 CHANNELS = {"channel": ["R", "G", "B"]}  # coordinate
 # of the spool
-COUNTS = ("sample_count", "saturated_count", "dark_count", "single_exposure_count")
+COUNTS = ("sample_count", "saturated_count", "dark_count")
 
 
 def surfel_group(

@@ -93,7 +93,7 @@ class Lumitexels:
     """Samples, and the outcomes for all visible pairs of light and camera."""
 
     sample: Any  # (n, light, camera, 3) float16 sr^-1; lazy
-    # (4, n) usable, saturated, dark, and usable from a single exposure
+    # (3, n) usable, saturated and dark
     counts: Index32
     view_count: Index  # (light, camera) samples of each view
     views: ViewLevels
@@ -278,9 +278,8 @@ class Sampler:
         spans = None
         if not whole:
             spans = pixel_spans(surfels, shot.pixels, height, width)
-        usable = np.zeros((height, width), np.uint8)
-        radiance, flag = merger.merge(frames, spans, usable=usable)
-        merged = MergedView(radiance, flag, usable)
+        radiance, flag = merger.merge(frames, spans)
+        merged = MergedView(radiance, flag)
         if whole:
             radiance[flag == SATURATED] = np.nan
         if picture:

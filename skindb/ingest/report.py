@@ -168,22 +168,18 @@ def describe_samples(
 ) -> dict[str, Any]:
     """Samples per sampled surfel and fraction of sampled surfels, also by region;
     devices without samples.
-
-    Also the fraction of the samples that come from a single exposure.
     """
     count = lumitexels.counts[0]
     views = lumitexels.view_count
     parts = {WHOLE_SURFACE: _quantiles(count)}
     for name, region in zip(surfels.region_names, surfels.region.T, strict=True):
         parts[name] = _quantiles(count[region])
-    single = float(lumitexels.counts[3].sum() / max(count.sum(), 1))
     cameras = [camera.id for camera in dome.cameras]
     lights = zip(dome.lights, views.sum(axis=1), strict=True)
     return {
         "of": int(views.size),
         "surfels": len(count),
         "parts": parts,
-        "single_exposure_fraction": round(single, 4),
         "cameras": dict(zip(cameras, views.sum(axis=0).tolist(), strict=True)),
         "lights_without": [light.id for light, number in lights if number == 0],
     }
@@ -197,8 +193,6 @@ def sample_lines(samples: Mapping[str, Any]) -> list[str]:
         f"samples per surfel: mean {face['mean']:,} ({quantiles}) of {samples['of']:,}; "
         f"{face['seen']:.0%} of {samples['surfels']:,} surfels have any"
     )
-    if fraction := samples["single_exposure_fraction"]:
-        summary += f"; {fraction:.1%} of the samples come from a single exposure"
     cameras = [name for name, number in samples["cameras"].items() if number == 0]
     return [
         summary,

@@ -37,7 +37,7 @@ REMOVED_SUFFIX = ".gone"  # of the folder of a spool that is being removed
 JOURNAL = "journal"
 SEAL_BYTES = 32  # length of the digest before the content of every small file
 TILE = 64  # samples and surfels that are transposed together
-STATES = 4  # usable, saturated, dark, and usable from a single exposure
+STATES = 3  # usable, saturated, dark
 
 
 class Spool:

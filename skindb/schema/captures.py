@@ -21,11 +21,6 @@ DARK_COUNT = declare(
     "int32 samples/dark_count(surfel) [1]",
     "visible pairs lost because every exposure was below the noise floor",
 )
-SINGLE_EXPOSURE_COUNT = declare(
-    "int32 samples/single_exposure_count(surfel) [1]",
-    "usable samples of which no pixel has a second exposure, neither white nor dark, "
-    "that would confirm it",
-)
 NOISE_FLOOR = declare(
     "float64 samples/noise_floor() [sr-1]",
     "reflectance of one standard deviation of read noise and quantisation, at the "
@@ -238,11 +233,7 @@ GLARE_FRACTION = declare(
 )
 CALIBRATED_FALLOFF = declare(
     "float64 light_calibration/calibrated_falloff(light) [1]",
-    "exponent n of the angular fall-off cos^n",
-)
-CALIBRATED_FALLOFF_ERROR = declare(
-    "float64 light_calibration/calibrated_falloff_error(light) [1]",
-    "its standard error; 0 where it was given",
+    "exponent n of the angular fall-off cos^n, as stated in the set-up",
 )
 TARGET_USED_FRACTION = declare(
     "float64 light_calibration/target_used_fraction(light) [1]",

@@ -7,15 +7,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from merged_by_numpy import merged_by_numpy
 
-from skindb.calibration._merge_kernels import DARK, DARK_SIGMA, OK, SATURATED
+from skindb.calibration._merge_kernels import DARK, OK, SATURATED
 from skindb.calibration.radiance import (
     FrameMerger,
     frame_merger,
     merge_exposures,
     radiance_floor,
-    read_sigma,
-    relative_exposure,
     vignette_gain,
 )
 from skindb.format.folder import read_capture
@@ -30,18 +29,6 @@ SENSOR = SensorRecord(
     electrons_per_dn=0.3,
 )
 SECONDS = (0.04, 0.005)
-
-
-def usable_exposures(frames, sensor):
-    """Number of exposures (h, w) in which no channel is at the white level and one is
-    above the dark level.
-    """
-    count = np.zeros(frames[0].shape[:2], np.uint8)
-    for frame in frames:
-        signal, slope = relative_exposure(frame, None, sensor)
-        lit = (signal > DARK_SIGMA * read_sigma(slope, sensor)).any(axis=-1)
-        count += lit & (frame < sensor.white).all(axis=-1)
-    return count
 
 
 def expose(radiance, seconds, rng, sensor=SENSOR):
@@ -98,7 +85,7 @@ def test_merge_exposures__subtracts_the_dark_frame_and_divides_the_vignette():
     frame = np.full((4, 4, 3), 356 + 6528, np.uint16)
     vignette = np.full((4, 4, 1), 0.5, np.float32)
     radiance, _, _ = merge_exposures(
-        [frame], (0.1,), SENSOR, dark=(dark,), vignette=vignette
+        [frame], (0.1,), SENSOR, dark=dark[None], vignette=vignette
     )
     np.testing.assert_allclose(radiance, 6528 / (65535 - 256) / 0.1 / 0.5, rtol=1e-6)
 
@@ -230,15 +217,15 @@ def test_frame_merger__develops_as_merge_exposures(pristine, with_dark, curved):
             for frame in frames:
                 frame[9:12, 9:12], frame[9:12, 12:15, 1] = 0, top
             gain = vignette_gain(camera)
-            want, _, want_flag = merge_exposures(
-                frames, seconds, sensor, dark=dark, vignette=gain
+            options = {"dark": dark, "vignette": gain}
+            want, spread, want_flag = merged_by_numpy(
+                frames, seconds, sensor, **options
             )
-            usable = np.zeros(want_flag.shape, np.uint8)
-            got, flag = FrameMerger(camera, seconds, dark).merge(frames, usable=usable)
+            whole, error, _ = merge_exposures(frames, seconds, sensor, **options)
+            np.testing.assert_allclose(error, spread, rtol=1e-6)
+            got, flag = FrameMerger(camera, seconds, dark).merge(frames)
+            np.testing.assert_array_equal(got, whole)
             np.testing.assert_array_equal(flag, want_flag)
-            if not with_dark:  # dark frames move the dark level of each pixel
-                np.testing.assert_array_equal(usable, usable_exposures(frames, sensor))
-                assert len(np.unique(usable)) > 1
             assert set(np.unique(flag)) == {OK, SATURATED, DARK}
             # single precision: a handful of roundings of 6e-8; differences of nearly
             # equal values need atol
@@ -384,28 +371,6 @@ def test_merge_exposures__has_no_halo_at_bright_edges():
     z = ((radiance - truth) / error).mean(axis=(0, 2))
     # a mean of 600 values with unit variance in each of 100 columns: 5 standard errors
     assert np.abs(z).max() < 5 / np.sqrt(600)
-
-
-def test_frame_merger__counts_exposures_that_are_neither_dark_nor_saturated():
-    levels = np.array([0.0, 0.5, 1.5, 3.0, 6.0, 12.0]) / BRACKETS[0]
-    truth = np.broadcast_to(levels[None, :, None], (1, 6, 3))
-    quiet = SensorRecord(
-        FrameKind(6, 1, 16), BLACK, WHITE, 1.0, FULL / (WHITE - BLACK), STEP
-    )
-    frames = [
-        np.rint(BLACK + np.minimum(truth * t, 1) * (WHITE - BLACK)).astype(np.uint16)
-        for t in BRACKETS
-    ]
-    camera = SimpleNamespace(
-        sensor=quiet,
-        colour_matrix=np.eye(3),
-        vignette=np.zeros(3),
-        gain=(1.0, 1.0, 1.0),
-    )
-    usable = np.zeros((1, 6), np.uint8)
-    FrameMerger(camera, BRACKETS).merge(frames, usable=usable)
-    assert usable.tolist() == [[0, 4, 3, 2, 1, 0]]
-    np.testing.assert_array_equal(usable, usable_exposures(frames, quiet))
 
 
 # extreme inputs

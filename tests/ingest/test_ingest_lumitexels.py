@@ -190,29 +190,6 @@ def test_describe_samples__one_camera_one_light_and_none(capture, surfels, tmp_p
     ]
 
 
-def test_sampler__counts_samples_of_a_single_exposure(capture_folder, tmp_path):
-    """The noise of a value is 10: the short exposure of 15 above black is dark, of 2000
-    it is not.
-    """
-    capture = read_capture(capture_folder)
-    dome = replace(
-        capture.dome, lights=capture.dome.lights[:1], cameras=capture.dome.cameras[:1]
-    )
-    surfels = build_surfels(capture, spacing_mm=8.0)
-    for short, expected in ((15, 1.0), (2000, 0.0)):
-        for exposure, value in (("long", 10 * short), ("short", short)):
-            frame = np.full((64, 72, 3), BLACK + value, np.uint16)
-            save(capture_folder / f"dome/frames/{exposure}/l0_c0.png", frame)
-        _, found = sampled(dome, surfels, tmp_path / str(short))
-        assert found.counts[0].sum() > 100
-        np.testing.assert_array_equal(found.counts[3], expected * found.counts[0])
-        said = sample_lines(describe_samples(found, surfels, dome))[0]
-        assert said.endswith("; 100.0% of the samples come from a single exposure") == (
-            expected == 1
-        )
-        assert ("single" in said) == (expected == 1)
-
-
 def test_sampler__counts_what_is_lost(capture_folder, tmp_path):
     """All exposures of one view at the white level except for a corner, and those of
     another at black.

@@ -6,13 +6,11 @@ from skindb.calibration._merge_kernels import DARK, OK, SATURATED
 from skindb.geometry.atlas import bilinear
 from skindb.ingest._sample_kernels import (
     NONE,
-    SINGLE,
     MergedView,
     PointLight,
     gather,
     pixel_counts,
     pixel_spans,
-    tally,
     view_levels,
 )
 
@@ -29,7 +27,6 @@ def sampled(
     falloff=0.0,
     wanted=None,
     far=None,
-    usable=None,
 ):
     """Samples of points near the origin, as floats, and the outcome of them."""
     n = len(pixels)
@@ -37,11 +34,7 @@ def sampled(
     out = np.zeros((3, n), np.uint16)
     outcome = np.zeros(n, np.uint8)
     gather(
-        MergedView(
-            np.asarray(radiance, np.float32),
-            flag,
-            np.full_like(flag, 2) if usable is None else usable,
-        ),
+        MergedView(np.asarray(radiance, np.float32), flag),
         np.ones(n, bool) if wanted is None else wanted,
         np.asarray(pixels, np.float32),
         position,
@@ -181,27 +174,12 @@ def test_pixel_counts__inverse_of_the_squared_weights_of_every_pixel():
     np.testing.assert_allclose(found, 1 / square, rtol=2e-3)  # half floats
 
 
-def test_gather__samples_of_a_single_exposure():
-    """Single where no pixel that takes part has two exposures; one of weight 0 takes no part."""
-    image = np.ones((6, 8, 3))
-    flag = np.zeros((6, 8), np.uint8)
-    usable = np.ones((6, 8), np.uint8)
-    usable[:, 4:] = 2
-    pixels = [[2.0, 3.0], [4.0, 3.0], [3.5, 3.0], [5.0, 3.0]]
-    got, outcome = sampled(image, flag, pixels, usable=usable)
-    assert outcome.tolist() == [SINGLE, OK, SINGLE, OK]
-    assert np.isfinite(got).all()
-    counts = np.zeros((4, 4), np.int32)
-    assert tally(outcome, counts) == 4
-    assert counts.tolist() == [[1] * 4, [0] * 4, [0] * 4, [1, 0, 1, 0]]
-
-
 def test_view_levels__as_numpy():
     rng = np.random.default_rng(3)
     for count in (1, 2, 7, 8):
         samples = rng.normal(1, 3, (3, 20)).astype(np.float16)
         outcome = np.full(20, NONE, np.uint8)
-        outcome[:count] = [OK, SINGLE] * (count // 2) + [OK] * (count % 2)
+        outcome[:count] = OK
         usable = samples[:, :count].astype(float)
         levels = view_levels(samples.view(np.uint16), outcome, 2.0)
         bright = (usable > 2).any(axis=0).mean()
