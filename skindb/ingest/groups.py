@@ -14,7 +14,7 @@ from skindb.format.dome import DomeRecord, SequenceRecord
 from skindb.format.folder import Capture
 from skindb.geometry.atlas import distortion
 from skindb.ingest.consistency import Calibration
-from skindb.ingest.lumitexels import FULL_SHADOW, MIN_LIT_FRACTION, Lumitexels
+from skindb.ingest.lumitexels import Lumitexels
 from skindb.ingest.probe_profiles import Profiles
 from skindb.ingest.surfels import SurfelSet, transferred_landmarks
 from skindb.parameters import SCAN_ERROR_DEGREES
@@ -49,14 +49,9 @@ def surfel_group(
         variables["region_mask"] = surfels.region.astype(np.int8)
         coords["region"] = list(surfels.region_names)
     if dome is not None and light_fraction is not None:
-        soft = np.zeros(len(surfels.position), np.int32)
-        # not all at once: memory
-        for fraction in light_fraction.T:
-            soft += (fraction >= FULL_SHADOW) & (fraction < MIN_LIT_FRACTION)
         variables |= {
             "light_visible_fraction": light_fraction,
             "camera_visible_fraction": camera_fraction,
-            "soft_light_count": soft,
         }
         coords |= _dome_names(dome)
     return dataset(variables, coords=coords)
@@ -188,16 +183,6 @@ def probe_group(
         variables["fibre_azimuth"] = probe.azimuth
     if isotropy is not None:
         variables["site_isotropy_p_value"] = isotropy
-    if any(len(site) > 1 for site in logs):
-        variables["placement_profile"] = _padded(profiles.placements)
-    if any(log is not None and len(log) > 1 for site in logs for log in site):
-        # (site, placement, sample, time and pressure); a value without a time is a log
-        # with one entry
-        empty = np.full((0, 2), np.nan)
-        padded = _padded(
-            [_padded([empty if log is None else log for log in site]) for site in logs]
-        )
-        variables |= {"pressure_time": padded[..., 0], "pressure": padded[..., 1]}
     coords = {"site": list(probe.sites), "fibre": list(probe.fibres)} | CHANNELS
     return dataset(variables, coords=coords)
 
@@ -220,15 +205,6 @@ def _mean_pressure(logs: Sequence[Float64 | None]) -> float:
     """Mean pressure over time and placements; NaN for a site without a gauge."""
     means = [log[:, 1].mean() for log in logs if log is not None]
     return float(np.mean(means)) if means else np.nan
-
-
-def _padded(arrays: Sequence[Float64]) -> Float64:
-    """Arrays stacked along a new first axis, NaN where one is shorter."""
-    shape = np.max([array.shape for array in arrays], axis=0)
-    out = np.full((len(arrays), *shape), np.nan)
-    for target, array in zip(out, arrays, strict=True):
-        target[tuple(slice(size) for size in array.shape)] = array
-    return out
 
 
 def photograph_group(photographs: Mapping[tuple[int, int], Image]) -> xr.Dataset:

@@ -62,7 +62,6 @@ R = TypeVar("R")
 MAX_PENDING_VIEWS = 24
 # visible fraction of a light's disc below which a surfel is in the penumbra
 MIN_LIT_FRACTION = 0.999
-FULL_SHADOW = 1e-3
 MIN_COSINE_CAMERA = 0.1  # between the normal and the direction to the camera
 # mm of surface covered by one pixel; beyond it, samples were measured 20 % too bright
 MAX_SMEAR_MM = 12.0

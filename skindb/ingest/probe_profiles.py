@@ -91,7 +91,6 @@ class Profiles:
     value: Float64  # (site, fibre, 3) mean over placements
     error: Float64  # (site, fibre, 3) standard error
     scale_known: bool
-    placements: tuple[Float64, ...]  # for each site (placement, fibre, 3)
     # (site, 3) relative standard deviation between placements; NaN of a single one
     repeatability: Float64
 
@@ -139,8 +138,7 @@ def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profil
     )
     if probe.scale is not None:
         _require_energy(probe, value, error)
-    single = tuple(placements * factor for placements, _ in signals)
-    return Profiles(value, error, probe.scale is not None, single, spread)
+    return Profiles(value, error, probe.scale is not None, spread)
 
 
 def _light_faults(

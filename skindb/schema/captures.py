@@ -70,10 +70,6 @@ SURFEL_AREA = declare(
     "a third of the area of the adjacent triangles",
     uses=Use.COPIED | Use.SAMPLED | Use.SURVIVES_EDIT,
 )
-SOFT_LIGHT_COUNT = declare(
-    "int32 surfels/soft_light_count(surfel) [1]",
-    "lights whose disc is partly visible from the surfel, at the soft edge of a shadow",
-)
 SURFEL_UV = declare(
     "float32 surfels/surfel_uv(surfel, uv) [1]",
     "texture coordinates, v = 0 at the top row",
@@ -503,23 +499,10 @@ SITE_ISOTROPY_P_VALUE = declare(
     "profiles are too noisy",
     f"{PAPER}, figure 10",
 )
-PLACEMENT_PROFILE = declare(
-    "float32 probe/placement_profile(site, placement, fibre, channel) [mm-2]",
-    "profile of each placement of the probe, in the units of fibre_profile; NaN where "
-    "there are fewer",
-)
 FIBRE_AZIMUTH = declare(
     "float64 probe/fibre_azimuth(fibre) [degree]",
     "direction of the detection fibre from the source fibre, in the plane of the skin; "
     "NaN if unknown",
-)
-PRESSURE_TIME = declare(
-    "float64 probe/pressure_time(site, placement, pressure_sample) [s]",
-    "time of a reading of the gauge since the probe touched; NaN where there are fewer",
-)
-PRESSURE = declare(
-    "float64 probe/pressure(site, placement, pressure_sample) [kPa]",
-    "reading of the suction gauge",
 )
 
 # sequence

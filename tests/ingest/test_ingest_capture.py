@@ -42,9 +42,6 @@ def take(database):
 ABSENT = (
     "fibre_azimuth",
     "site_isotropy_p_value",
-    "placement_profile",
-    "pressure",
-    "pressure_time",
     "light_polarisation",
     "camera_polarisation",
     "relative_reflectance",

@@ -123,7 +123,6 @@ def _profiles(probe, rng, anisotropy=0.0):
         value,
         np.broadcast_to(error, shape),
         False,
-        (),
         np.full((len(probe.sites), 3), np.nan),
     )
 
@@ -214,7 +213,7 @@ def _skin(probe, decay=(0.5, 0.8, 1.2), gain=1.0, distance=DISTANCE):
         probe, distance=distance, fibres=tuple(f"f{i}" for i in range(len(DISTANCE)))
     )
     return named, Profiles(
-        value, 0.01 * value, False, (), np.full((len(probe.sites), 3), np.nan)
+        value, 0.01 * value, False, np.full((len(probe.sites), 3), np.nan)
     )
 
 

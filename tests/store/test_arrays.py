@@ -74,7 +74,7 @@ def test_array__every_variable_of_a_group_is_decoded_directly(tmp_path):
     arrays = {
         "surfel_position": rng.random((N, 3)).astype(np.float32),
         "region_mask": rng.integers(0, 2, (N, 2)).astype(np.int8),
-        "soft_light_count": rng.integers(0, 150, N).astype(np.int32),
+        "sample_count": rng.integers(0, 150, N).astype(np.int32),
         "light_visible_fraction": rng.random((N, 150)).astype(np.float16),
     }
     ds = dataset(arrays)
