@@ -1,5 +1,5 @@
-"""Calibration of the cameras of a dome: response, noise, vignette, colour and dark
-level, with their errors; the colour matrix follows from a photographed colour chart.
+"""Calibration of the cameras of a dome: response, noise, vignette, colour and
+defect pixels, with their errors; the colour matrix follows from a photographed colour chart.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from skindb.calibration.radiance import (
 )
 from skindb.calibration.response import (
     TABLE_ROWS,
-    average_dark,
+    defect_pixels,
     fit_noise,
     recover_response,
 )
@@ -270,18 +270,8 @@ def _dark(
     frames: CalibrationFrames, kind: CameraFrames, camera: CameraRecord
 ) -> tuple[CameraRecord, Values]:
     (repeats,) = frames.read(kind.frames, camera, repeats=kind.repeats)
-    dark = average_dark(np.stack(repeats))
-    good = ~dark.defect
-    level = [dark.mean[good[..., c], c].mean() for c in range(3)]
-    error = [
-        np.sqrt((dark.error[good[..., c], c] ** 2).sum()) / good[..., c].sum()
-        for c in range(3)
-    ]
-    return camera, {
-        "dark_level": np.array(level),
-        "dark_level_error": np.array(error),
-        "defect_pixels": float(dark.defect.any(axis=-1).sum()),
-    }
+    defect = defect_pixels(np.stack(repeats))
+    return camera, {"defect_pixels": float(defect.any(axis=-1).sum())}
 
 
 def _response(
@@ -376,7 +366,7 @@ def _reprojection(points: KnownPoints, camera: CameraRecord) -> Values:
         "calibrate K, R, t and distortion of the camera again, or correct "
         "positions and pixels of the points",
     )
-    return {"reprojection_rms": rms, "reprojection_max": float(error.max())}
+    return {"reprojection_rms": rms}
 
 
 def _merged(frames: CalibrationFrames, template: str, camera: CameraRecord) -> Float32:

@@ -1,6 +1,6 @@
 """Response of a camera from a stack of exposures of a static scene (Debevec and Malik
 1997), and noise of its sensor: read noise and electrons per value from pairs of flat
-frames (photon transfer; Janesick 2007), mean dark frame and defect pixels.
+frames (photon transfer; Janesick 2007), and defect pixels.
 """
 
 from __future__ import annotations
@@ -426,20 +426,9 @@ def _line(x: Float64, y: Float64, count: int) -> tuple[Float64, Float64, float]:
     return solution, covariance, float(square / max(len(x) - 2, 1))
 
 
-@dataclass(frozen=True)
-class DarkFrame:
-    """Mean, its standard error, and mask of defect pixels, each (height, width, 3), in
-    values of the file.
-    """
-
-    mean: Float64
-    error: Float64
-    defect: Mask
-
-
-def average_dark(frames: ArrayLike) -> DarkFrame:
-    """Average dark frames of one exposure time, and mark pixels that are hot, stuck or
-    unusually noisy.
+def defect_pixels(frames: ArrayLike) -> Mask:
+    """Mask (height, width, 3) of the pixels of dark frames of one exposure time that are
+    hot, stuck or unusually noisy.
 
     A pixel is a defect if its mean or its deviation in time differs from the median of
     its neighbourhood by more than MAX_DEVIATIONS robust standard deviations of such
@@ -452,12 +441,11 @@ def average_dark(frames: ArrayLike) -> DarkFrame:
         (frame, height, width, 3) values of the file, at least two frames. The lens is covered.
     """
     values = np.asarray(frames).astype(float)
-    mean = values.mean(axis=0)
     spread = values.std(axis=0, ddof=1)
-    defect = _outliers(mean) | _outliers(spread)
+    defect = _outliers(values.mean(axis=0)) | _outliers(spread)
     if len(values) > 3 and np.median(spread) > 0:
         defect |= spread == 0
-    return DarkFrame(mean, spread / np.sqrt(len(values)), defect)
+    return defect
 
 
 def _outliers(picture: Float64) -> Mask:

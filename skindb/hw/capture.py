@@ -160,11 +160,6 @@ def run_capture(
         notes += run.notes
     notes += _measure_sites(session, setup, devices, plan, place, progress or silent)
     write_capture(session, setup, subject, files=files)
-    for site in session.sites:
-        if site["lost_readings"]:
-            notes.append(
-                f"{site['site']}: {site['lost_readings']} readings of the gauge were lost"
-            )
     return _report(session, schedule, run, notes)
 
 
@@ -303,9 +298,6 @@ def _measure_sites(
 def _report(
     session: Unfinished, schedule: Schedule, run: DomeRun | None, notes: list[str]
 ) -> dict[str, Any]:
-    drift = dict[str, float]()
-    for entry in session.sites:
-        drift[entry["site"]] = max(drift.get(entry["site"], 0.0), entry["drift_kpa"])
     return {
         "path": str(session.folder),
         "steps": len(schedule.steps),
@@ -313,6 +305,6 @@ def _report(
         "frames_of_this_session": 0 if run is None else len(run.frames),
         "seconds": schedule.seconds,
         "flashes_per_second": session.flashes_per_second,
-        "sites": {site: {"pressure_drift_kpa": value} for site, value in drift.items()},
+        "sites": sorted({entry["site"] for entry in session.sites}),
         "notes": notes,
     }

@@ -34,7 +34,7 @@ from skindb.limits import MAX_FIBRES
 
 UNFINISHED = "unfinished.json"  # removed when the capture is complete
 STEP_KEYS = {"light", "exposure", "t_on", "t_off", "trigger_count"}
-SITE_KEYS = {"site", "number", "pressure", "suffix", "drift_kpa", "lost_readings"}
+SITE_KEYS = {"site", "number", "pressure", "suffix"}
 FRAMES = "dome/frames/{exposure}/{light}_{camera}"  # without the suffix of the files
 SITE_FRAMES = "contact/{site}/{exposure}-{placement}"
 
@@ -362,14 +362,11 @@ def keep_site(session: Unfinished, run: SiteRun, number: int) -> None:
             session.folder
             / f"{SITE_FRAMES.format(site=run.site, exposure=exposure, placement=number)}{suffix}",
         )
-    placement = run.placement
     entry = {
         "site": run.site,
         "number": number,
         "suffix": suffix,
-        "drift_kpa": placement.drift,
-        "pressure": np.round(placement.pressure, 4).tolist(),
-        "lost_readings": placement.lost_readings,
+        "pressure": np.round(run.placement.pressure, 4).tolist(),
     }
     session.sites.append(entry)
     session.save()

@@ -73,7 +73,6 @@ class Dome:
         self.link = link
         values = link.hello(KIND).values
         self.name = values.get("name", "")
-        self.firmware = values.get("firmware", "")
         self.lights = tuple(values.get("lights", "").split(","))
 
     @property

@@ -60,13 +60,6 @@ class Placement:
 
     triggers: Mapping[str, int]  # exposure -> trigger pulses sent to its camera
     pressure: Log  # (n, 2) s since the suction began, kPa; at least one reading
-    lost_readings: int  # number of gauge readings that did not arrive
-
-    @property
-    def drift(self) -> float:
-        """Largest deviation [kPa] of the pressure from that at the first exposure."""
-        kpa = self.pressure[:, 1]
-        return float(np.abs(kpa - kpa[0]).max())
 
 
 class Gauge:
@@ -163,9 +156,7 @@ class Probe:
 
     def __init__(self, link: Link) -> None:
         self.link = link
-        values = link.hello(KIND).values
-        self.name = values.get("name", "")
-        self.firmware = values.get("firmware", "")
+        link.hello(KIND)
 
     def measure(
         self,
@@ -203,7 +194,6 @@ class Probe:
                 "use about -5 kPa",
             )
         self.link.discard_events()
-        lost = self.link.lost_events
         with stopped_at_end(self.stop):
             gauge = Gauge(self.link, pressure)
             self.link.request("PUMP", kpa=f"{pressure:g}")
@@ -216,7 +206,7 @@ class Probe:
                 if progress is not None:
                     progress(number + 1, len(exposures))
         log = np.array(gauge.readings[unused:])
-        return Placement(triggers, log, self.link.lost_events - lost)
+        return Placement(triggers, log)
 
     def stop(self) -> None:
         """Switch off light and pump, and open the valve.

@@ -394,18 +394,6 @@ REPROJECTION_RMS = declare(
     "float64 camera_calibration/reprojection_rms(camera) [pixel]",
     "rms distance of known points from their projections",
 )
-REPROJECTION_MAX = declare(
-    "float64 camera_calibration/reprojection_max(camera) [pixel]",
-    "largest of these distances",
-)
-DARK_LEVEL = declare(
-    "float64 camera_calibration/dark_level(camera, channel) [value]",
-    "mean value of dark frames",
-)
-DARK_LEVEL_ERROR = declare(
-    "float64 camera_calibration/dark_level_error(camera, channel) [value]",
-    "its standard error",
-)
 DEFECT_PIXELS = declare(
     "float64 camera_calibration/defect_pixels(camera) [1]",
     "pixels that are hot, stuck or unusually noisy",

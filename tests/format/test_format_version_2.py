@@ -130,7 +130,6 @@ def test_read_capture__two_equal_placements_are_one_with_less_noise(
     np.testing.assert_allclose(both.value, once.value)
     np.testing.assert_array_equal(both.repeatability, 0.0)
     assert np.isnan(once.repeatability).all()
-    assert len(both.placements[0]) == 2
 
 
 def test_read_capture__version_1_keeps_these_keys_as_they_are(second):

@@ -55,9 +55,6 @@ def test_measure__keeps_the_readings_of_the_exposures():
     assert placement.pressure[-1, 0] - placement.pressure[0, 0] == pytest.approx(
         4.0, abs=0.3
     )
-    assert placement.drift == pytest.approx(
-        np.abs(placement.pressure[:, 1] - placement.pressure[0, 1]).max()
-    )
 
 
 @pytest.mark.parametrize(

@@ -182,7 +182,6 @@ def test_calibrate_cameras__finds_what_was_put_in(pristine, tmp_path, gamma):
     )
     assert found["chart_difference"].max() < 1
     assert found["defect_pixels"].values.tolist() == [1, 1]
-    assert np.abs(found["dark_level"] - BLACK).max() < (1 if gamma == 1 else 10)
     known = (
         np.isfinite(found["calibrated_response"])
         .all(["response_level", "channel"])
