@@ -6,6 +6,7 @@ The scheduler of a cluster imports this module, so it imports nothing large.
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import signal
@@ -19,6 +20,7 @@ from concurrent.futures import (
     FIRST_COMPLETED,
     CancelledError,
     Future,
+    ThreadPoolExecutor,
     wait,
 )
 from concurrent.futures import Executor as Pool
@@ -327,6 +329,8 @@ def connected(address: str) -> Iterator[Client]:
             if address.endswith(".json")
             else address
         )
+        with ThreadPoolExecutor(1) as apart:  # a notebook has its own event loop
+            apart.submit(asyncio.run, _greet(url)).result()
         client = Client(url, timeout=CONNECT_SECONDS, set_as_default=False)
     # of any kind: the file and the server are not ours
     except Exception as error:  # noqa: BLE001
@@ -415,6 +419,20 @@ def _limit_blas(name: str, dask_worker: Worker) -> None:
 
 def _restore_blas(name: str, dask_worker: Worker) -> None:
     dask_worker.__dict__.pop(name).restore_original_limits()
+
+
+async def _greet(address: str) -> None:
+    """Fail soon where no scheduler is: a `Client` would wait, and leave a traceback
+    when it is removed.
+    """
+    from distributed import Security
+    from distributed.comm import connect
+
+    how = Security().get_connection_args("client")
+    comm = await asyncio.wait_for(
+        connect(address, timeout=CONNECT_SECONDS, **how), CONNECT_SECONDS + 1
+    )
+    comm.abort()
 
 
 def dashboard_link(client: Client) -> str:
