@@ -35,15 +35,6 @@ MAX_ERROR_DEGREES = 30.0
 
 
 @kernel
-def _angle(a: Vector, b: Vector) -> float:
-    """Angle in degrees between unit vectors; NaN for NaN."""
-    cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-    if math.isnan(cosine):
-        return math.nan
-    return math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
-
-
-@kernel
 def _mean(white: float, normal: Matrix, out: Vector) -> None:
     """Unit mean of the two estimates, the photometric one weighted by `white`; one that
     is NaN is ignored.
@@ -83,14 +74,6 @@ def _variance(white: float, estimates: NormalEstimates, scan_error: float) -> fl
 
 
 @kernel
-def _unit_normal(scan: Vector, out: Vector) -> None:
-    """Write the normal of the scan with length 1; NaN for length 0."""
-    size = math.sqrt(scan[0] ** 2 + scan[1] ** 2 + scan[2] ** 2)
-    for k in range(3):
-        out[k] = scan[k] / size if size > 0.0 else math.nan
-
-
-@kernel
 def _combine(estimates: NormalEstimates, scan_error: float, out: Vector) -> float:
     """Write the mean of both estimates by inverse variance; returns the weight of the
     photometric one.
@@ -113,16 +96,15 @@ def _combine(estimates: NormalEstimates, scan_error: float, out: Vector) -> floa
 
 
 @kernel
-def _total_error(error: float, estimates: NormalEstimates) -> float:
+def _total_error(error: float, normal: Matrix) -> float:
     """Total error [degree] of the combined normal, whose standard error is given."""
+    cosine = 0.0
+    for k in range(3):
+        cosine += normal[0, k] * normal[1, k]
     # skin without colour has only one of the two estimates
-    apart = _angle(estimates.normal[0], estimates.normal[1])
-    apart = apart if apart == apart else 0.0
-    return math.sqrt(
-        (NOISE_FACTOR_NORMAL * error) ** 2
-        + apart * apart
-        + MODEL_ERROR_DEGREES * MODEL_ERROR_DEGREES
-    )
+    apart = math.acos(min(max(cosine, -1.0), 1.0)) if cosine == cosine else 0.0
+    square = math.degrees(apart) ** 2 + (NOISE_FACTOR_NORMAL * error) ** 2
+    return math.sqrt(square + MODEL_ERROR_DEGREES * MODEL_ERROR_DEGREES)
 
 
 @kernel
@@ -146,7 +128,9 @@ def normals_block(
     start = np.empty(3)
     estimates = normal_estimates()
     for s in range(position.shape[0]):
-        _unit_normal(scan[s], start)
+        size = math.sqrt(scan[s, 0] ** 2 + scan[s, 1] ** 2 + scan[s, 2] ** 2)
+        for k in range(3):
+            start[k] = scan[s, k] / size if size > 0.0 else math.nan
         estimate_normal(
             sample[s],
             position[s],
@@ -167,4 +151,4 @@ def normals_block(
                 chosen[s] = math.nan
                 error[s] = math.nan
             else:
-                total[s] = _total_error(error[s], estimates)
+                total[s] = _total_error(error[s], estimates.normal)

@@ -15,6 +15,7 @@ from skindb.fit.lumitexels import (
     by_name,
     noise_inputs,
 )
+from skindb.fit.normals import estimate_normals
 from skindb.optics.diffusion import dipole_s
 from skindb.parameters import BARE_SKIN
 from skindb.reflectance._separation_kernels import (
@@ -105,6 +106,15 @@ def estimate_diffuse_reflectance(
         ),
         eta=eta,
     )
+
+
+def estimate_in_sequence(
+    lumitexels: xr.Dataset, *, eta: float, scan_error: float
+) -> xr.Dataset:
+    """Normals from `estimate_normals`, and R_d for them."""
+    normals = estimate_normals(lumitexels, eta=eta, scan_error=scan_error)
+    lit = lumitexels.merge(normals)
+    return normals.merge(estimate_diffuse_reflectance(lit, eta=eta))
 
 
 def block_reflectance(

@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.fit.albedo import estimate_diffuse_reflectance
+from skindb.fit.albedo import estimate_in_sequence
 from skindb.fit.corrections import (
     MIN_GAIN_SPREAD,
     bounced_light,
@@ -21,7 +21,6 @@ from skindb.fit.corrections import (
     without_bounce,
 )
 from skindb.fit.lumitexels import directions, scan_error
-from skindb.fit.normals import estimate_normals
 from skindb.fit.plan import fitted_part, surface_of
 from skindb.fit.quality import HELD_OUT_ERRORS
 from skindb.fit.surface import fit_surface, held_out_error
@@ -87,28 +86,22 @@ class Trial:
         one_lobe = FitParameters(surface="ggx", eta=self.parameters.eta)
         surface = surface_of(few, one_lobe, None)
         part = fitted_part(few, self.held_out)
-        fitted = estimate_normals(part, eta=one_lobe.eta, scan_error=scan_error(part))
-        fitted = fitted.merge(
-            estimate_diffuse_reflectance(part.merge(fitted), eta=one_lobe.eta)
-        )
-        fitted = fitted.merge(
-            fit_surface(part.merge(fitted), surface=surface, eta=one_lobe.eta)
-        )
+        eta = one_lobe.eta
+        fitted = estimate_in_sequence(part, eta=eta, scan_error=scan_error(part))
+        lobes = fit_surface(part.merge(fitted), surface=surface, eta=eta)
+        fitted = fitted.merge(lobes)
         weighted = fitted.merge(few[["surfel_area"]])
         basis = surface.reduced(weighted, k=1, rng=np.random.default_rng(0))
         names = ("shading_normal", "diffuse_reflectance", *surface.parameter_variables)
         errors = {}
-        for of, other in (("light", "camera"), ("camera", "light")):
-            unseen = few.isel(
-                {
-                    of: np.flatnonzero(self.held_out[f"{of}_held_out"].values),
-                    other: np.flatnonzero(
-                        self.held_out[f"{other}_held_out"].values == 0
-                    ),
-                }
-            )
+        held = {
+            of: self.held_out[f"{of}_held_out"].values > 0 for of in HELD_OUT_ERRORS
+        }
+        for of in held:
+            chosen = {dim: held[dim] == (dim == of) for dim in held}
+            unseen = few.isel(chosen)
             judged = held_out_error(
-                unseen.merge(fitted[list(names)]), basis=basis, eta=one_lobe.eta, of=of
+                unseen.merge(fitted[list(names)]), basis=basis, eta=eta, of=of
             )
             relative = judged[HELD_OUT_ERRORS[of][0]].values
             errors[of] = relative * _rms(unseen["reflectance_sample"].values)
@@ -190,15 +183,13 @@ def choose_corrections(
     patches = _patches(len(count))
     near = np.concatenate([np.arange(p.start, p.stop) for p in patches])
     usable = near[count[near] >= MIN_SAMPLES]
-    counts = training.sizes["light"], training.sizes["camera"], len(usable)
-    if any(
-        n < m
-        for n, m in zip(counts, (MIN_LIGHTS, MIN_CAMERAS, MIN_SURFELS), strict=True)
-    ):
+    lights, cameras = training.sizes["light"], training.sizes["camera"]
+    enough = lights >= MIN_LIGHTS and cameras >= MIN_CAMERAS
+    if not enough or len(usable) < MIN_SURFELS:
         reason = (
             f"off: a choice needs {MIN_LIGHTS} lights, {MIN_CAMERAS} cameras and "
             f"{MIN_SURFELS} surfels of {MIN_SAMPLES} samples; found "
-            "{}, {} and {}".format(*counts)
+            f"{lights}, {cameras} and {len(usable)}"
         )
         return off, dict.fromkeys(undecided, reason)
     rng = np.random.default_rng([parameters.seed, STREAM])
@@ -207,8 +198,8 @@ def choose_corrections(
     flags = {
         f"{dim}_held_out": _drawn(few.sizes[dim], rng) for dim in ("light", "camera")
     }
-    lights = np.flatnonzero(held_out["light_held_out"].values == 0)
-    trial = Trial(capture, training, lights, surfels, dataset(flags), parameters)
+    fitted = np.flatnonzero(held_out["light_held_out"].values == 0)
+    trial = Trial(capture, training, fitted, surfels, dataset(flags), parameters)
     return _tried(trial, few, undecided, off)
 
 

@@ -55,7 +55,6 @@ def estimate_light_gains(
     *,
     rng: np.random.Generator,
     eta: float = 1.3,
-    unseen: float = 1.0,
 ) -> xr.Dataset:
     """Ratio of the true to the calibrated intensity of each light, by comparison of
     samples under different lights.
@@ -76,13 +75,12 @@ def estimate_light_gains(
         Selects the surfels that are used.
     eta
         Refractive index of F_t.
-    unseen
-        Gain of lights without usable surfels.
 
     Returns
     -------
     Dataset
-        `light_gain` (light), whose median over the lights with usable surfels is 1. Errors
+        `light_gain` (light), whose median over the lights with usable surfels is 1, as the
+        gain of the others. Errors
         of up to 2.5 % remained on captures with known truth: use the gains for lights
         whose intensities are less accurate than this.
 
@@ -95,7 +93,7 @@ def estimate_light_gains(
     matrix = _residual_form(lumitexels, [light], rng=rng, eta=eta)
     gain = _solved(matrix, len(light))[0]
     return dataset(
-        {"light_gain": np.where(np.isnan(gain), unseen, gain)},
+        {"light_gain": np.nan_to_num(gain, nan=1.0)},
         coords={"light": lumitexels["light"].values}
         if "light" in lumitexels.coords
         else None,

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from skindb.fit.albedo import estimate_diffuse_reflectance
+from skindb.fit.albedo import estimate_in_sequence
 from skindb.fit.lumitexels import (
     GEOMETRY,
     POLARISATION,
@@ -21,7 +21,6 @@ from skindb.fit.lumitexels import (
     scan_error,
     take_noise,
 )
-from skindb.fit.normals import estimate_normals
 from skindb.fit.surface import noise_floor
 from skindb.geometry.interreflection import tangent_frames
 from skindb.optics.fresnel import circular_reversal, fresnel_transmittance
@@ -216,8 +215,7 @@ def _spread(size: int, count: int) -> Array:
 
 def _estimated(part: xr.Dataset, eta: float, scan_error: float) -> xr.Dataset:
     """The surfels with estimates of the normal and of R_d."""
-    part = part.merge(estimate_normals(part, eta=eta, scan_error=scan_error))
-    return part.merge(estimate_diffuse_reflectance(part, eta=eta))
+    return part.merge(estimate_in_sequence(part, eta=eta, scan_error=scan_error))
 
 
 def _refined(part: xr.Dataset, prior: Gloss, eta: float, scan_error: float) -> JointFit:

@@ -16,7 +16,7 @@ from dask.callbacks import Callback
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
-from skindb.fit.albedo import estimate_diffuse_reflectance
+from skindb.fit.albedo import estimate_in_sequence
 from skindb.fit.choice import choose_corrections
 from skindb.fit.corrections import (
     bounced_light,
@@ -29,7 +29,6 @@ from skindb.fit.energy import crossed_gloss, energy_prior, without_even_reflecti
 from skindb.fit.gloss import estimate_gloss
 from skindb.fit.joint import refine_jointly
 from skindb.fit.lumitexels import lumitexels, relative_reflectance, scan_error
-from skindb.fit.normals import estimate_normals
 from skindb.fit.plan import fitted_part, hold_out, plan_fit, surface_of
 from skindb.fit.quality import error_of_misfit, find_obstructed, suspects
 from skindb.fit.surface import fit_surface, refit_and_evaluate
@@ -196,17 +195,11 @@ def _fit_surfels(
     """
     eta = parameters.eta
     prior = scan_error(samples)
-    estimates = estimate_normals(samples, eta=eta, scan_error=prior)
-    diffuse = estimate_diffuse_reflectance(samples.merge(estimates), eta=eta)
-    estimates = estimates.merge(diffuse)
-    estimates = estimates.assign(
-        refine_jointly(
-            samples.merge(estimates),
-            eta=eta,
-            scan_error=prior,
-            gloss=gloss,
-        )
+    estimates = estimate_in_sequence(samples, eta=eta, scan_error=prior)
+    refined = refine_jointly(
+        samples.merge(estimates), eta=eta, scan_error=prior, gloss=gloss
     )
+    estimates = estimates.assign(refined)
     terms = fit_surface(
         samples.merge(estimates), surface=surface, mode=parameters.mode, eta=eta
     )
@@ -280,7 +273,12 @@ def second_pass(
     # the values that were actually used
     settings = parameters.as_dict() | surface_model(basis).settings
     model.attrs = take_attrs(capture.attrs) | {"parameters": settings}
-    model.attrs |= surface.provenance | _summaries(groups)
+    model.attrs |= surface.provenance | _report(groups["fitted"], held_out)
+    if "translucency" in groups:
+        sites = groups["translucency"]
+        model.attrs["translucency"] = summarise_translucency(sites)
+    if gains is not None:
+        model.attrs["light_gains"] = summarise_gains(gains)
     model.attrs |= {
         "surface_energy": energy,
         **{name: float(groups["fitted"][name]) for name in EVEN},
@@ -345,16 +343,6 @@ def _translucency(
     sites = sites.merge(probe[["site_position"]])
     fitted = groups["fitted"].merge(translucency_map(groups["fitted"], sites))
     return {"translucency": sites, "fitted": fitted}
-
-
-def _summaries(groups: Mapping[str, xr.Dataset]) -> dict[str, Any]:
-    """Attributes of a model that summarise its groups."""
-    summaries = _report(groups["fitted"], groups["held_out"])
-    if "translucency" in groups:
-        summaries["translucency"] = summarise_translucency(groups["translucency"])
-    if "light_gains" in groups:
-        summaries["light_gains"] = summarise_gains(groups["light_gains"])
-    return summaries
 
 
 def _direct_light(

@@ -206,10 +206,13 @@ def _quantiles(values: NDArray[Any], area: NDArray[Any]) -> NDArray[Any]:
     finite = np.isfinite(values)
     if not finite.any():
         return np.full(len(QUANTILES), np.nan)
-    order = np.argsort(values[finite], kind="stable")
-    below = np.cumsum(area[finite][order])
-    place = np.searchsorted(below, np.array([*QUANTILES.values()]) * below[-1])
-    return np.asarray(values[finite][order][np.minimum(place, len(below) - 1)])
+    quantiles = np.quantile(
+        values[finite],
+        [*QUANTILES.values()],
+        weights=area[finite],
+        method="inverted_cdf",
+    )
+    return np.asarray(quantiles)
 
 
 def _mean(values: NDArray[Any], area: NDArray[Any]) -> float:

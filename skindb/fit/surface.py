@@ -318,7 +318,11 @@ def _judged(
         diffuse = lumitexels[variables.DIFFUSE_REFLECTANCE] + even
         lumitexels = lumitexels.assign({variables.DIFFUSE_REFLECTANCE: diffuse})
     inputs = lumitexels[list(names)]
-    blocks = [inputs.isel(surfel=slice(a, b)) for a, b in pairwise(_cuts(lumitexels))]
+    size = lumitexels.sizes["surfel"]
+    cuts = np.append(np.arange(0, max(size, 1), SURFELS_PER_BLOCK), size)
+    if lumitexels["reflectance_sample"].chunks is not None:
+        cuts = np.cumsum([0, *lumitexels.chunksizes["surfel"]])
+    blocks = [inputs.isel(surfel=slice(a, b)) for a, b in pairwise(cuts)]
     parts, counts = joined_blocks(judge, blocks)
     columns = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
     coords = {} if evaluate else surface.labels
@@ -333,11 +337,10 @@ def _error_columns(judged: SurfaceFit, judgement: Judgement) -> dict[str, Array]
     }
     if judgement.outliers:
         columns["outlier_fraction"] = judged.outlier
-    held = judgement.held
-    for i, names in enumerate(HELD_OUT_ERRORS.values()):
-        if held is not None and (held & (i + 1)).any():
-            errors = judged.held_error[:, i].T
-            columns |= dict(zip(names, errors, strict=True))
+    if judgement.held is not None:
+        for i, names in enumerate(HELD_OUT_ERRORS.values()):
+            if (judgement.held & (i + 1)).any():
+                columns |= dict(zip(names, judged.held_error[:, i].T, strict=True))
     return columns
 
 
@@ -358,14 +361,6 @@ def joined_blocks(
         sums = [delayed(np.add)(*pair) if len(pair) > 1 else pair[0] for pair in pairs]
     parts, total = compute([part for part, _ in judged], sums[0])  # type: ignore[no-untyped-call]
     return parts, total
-
-
-def _cuts(lumitexels: xr.Dataset) -> NDArray[np.int64]:
-    """Boundaries of the blocks of surfels."""
-    count = lumitexels.sizes["surfel"]
-    if lumitexels["reflectance_sample"].chunks is None:
-        return np.append(np.arange(0, max(count, 1), SURFELS_PER_BLOCK), count)
-    return np.cumsum([0, *lumitexels.chunksizes["surfel"]])
 
 
 def _unique(*names: str) -> tuple[str, ...]:

@@ -324,10 +324,12 @@ def _report(minimum: Any, problem: Problem, *, rival: float, near: float) -> Pro
     off = float(np.hypot(gain @ problem.discrepancy(p), SIGMA_TR_ERROR))
     tr = float(np.exp(p[0]))
     unexplained, chance = _unexplained(problem, p)
+    size = len(p)
+    margin = min((p - LOWER[:size]).min(), (UPPER[:size] - p).min())
     all_near = tr * problem.distance.max() < 1
     verdicts = {
         ProbeStatus.UNIDENTIFIED: error > 1,
-        ProbeStatus.AT_BOUND: _at_bound(p),
+        ProbeStatus.AT_BOUND: margin < 1e-3,
         ProbeStatus.NOT_CONVERGED: minimum.status <= 0,
         ProbeStatus.OUT_OF_RANGE: a > RATIO_MAX * s or all_near,
         # before POOR_FIT, which statistics count
@@ -367,11 +369,6 @@ def _covariance(minimum: Any, problem: Problem, excess: float) -> tuple[Array, A
     ) + 1e-18 * np.eye(size)
     covariance += effect[:, fibres:] @ effect[:, fibres:].T
     return covariance, gain[0]
-
-
-def _at_bound(p: Array) -> bool:
-    size = len(p)
-    return bool((p - LOWER[:size] < 1e-3).any() or (UPPER[:size] - p < 1e-3).any())
 
 
 def _unexplained(problem: Problem, p: Array) -> tuple[float, float]:

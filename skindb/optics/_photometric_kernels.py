@@ -152,6 +152,16 @@ def _transmittance(cosine: Real, square: Real) -> Real:
     return ONE - HALF * minus * minus * (p * p + q * q) / (plus * plus * p * p)
 
 
+@inline_fast_kernel
+def _direction(position: Vector, target: Vector) -> tuple[float, float, float]:
+    """Unit direction from a position to a target."""
+    x = target[0] - position[0]
+    y = target[1] - position[1]
+    z = target[2] - position[2]
+    scale = 1.0 / math.sqrt(x * x + y * y + z * z)
+    return x * scale, y * scale, z * scale
+
+
 @fast_kernel
 def _point(
     position: Vector,
@@ -165,20 +175,12 @@ def _point(
     returns their number.
     """
     for i in range(light.shape[0]):
-        x = light[i, 0] - position[0]
-        y = light[i, 1] - position[1]
-        z = light[i, 2] - position[2]
-        scale = 1.0 / math.sqrt(x * x + y * y + z * z)
-        b.light[0, i] = x * scale
-        b.light[1, i] = y * scale
-        b.light[2, i] = z * scale
+        x, y, z = _direction(position, light[i])
+        b.light[0, i], b.light[1, i], b.light[2, i] = x, y, z
     count = 0
     for o in range(camera.shape[0]):
-        x = camera[o, 0] - position[0]
-        y = camera[o, 1] - position[1]
-        z = camera[o, 2] - position[2]
-        scale = 1.0 / math.sqrt(x * x + y * y + z * z)
-        cosine = np.float32((scan[0] * x + scan[1] * y + scan[2] * z) * scale)
+        x, y, z = _direction(position, camera[o])
+        cosine = np.float32(scan[0] * x + scan[1] * y + scan[2] * z)
         b.through[o] = ZERO
         if cosine > MIN_COSINE_CAMERA:
             b.through[o] = _transmittance(min(cosine, ONE), square)

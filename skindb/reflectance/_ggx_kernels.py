@@ -98,25 +98,21 @@ def lobe_value(
 
 @kernel
 def write_lobe(d: Vector, count: int, index: float, b: Lumitexel, lobe: Lobe) -> None:
-    """Write what a fit of the lobe needs of the chosen samples, for R_d (3,)."""
+    """Write what a fit of the lobe needs of the chosen samples, for R_d (3,); the lobe is
+    0 below the horizon.
+    """
     split_diffuse(d, count, b)
     for r in range(count):
-        _write_angles(r, index, b, lobe)
+        light = b.lit[b.pairs[r, 0]]
+        camera = b.seen[b.pairs[r, 1]]
+        square, fresnel = lobe_angles(r, index, b)
+        above = light > 0.0 and camera > 0.0
+        lobe.light[r] = light if above else 1.0
+        lobe.camera[r] = camera if above else 1.0
+        lobe.half[r] = min((light + camera) ** 2 / max(square, 1e-12), 1.0)
+        lobe.fresnel[r] = fresnel * light if above else 0.0
         lobe.target[r] = (b.target[0, r] + b.target[1, r] + b.target[2, r]) / 3.0
         lobe.body[r] = (b.scattered[0, r] + b.scattered[1, r] + b.scattered[2, r]) / 3.0
-
-
-@kernel
-def _write_angles(r: int, index: float, b: Lumitexel, lobe: Lobe) -> None:
-    """Write what the lobe needs of the directions of a sample; 0 below the horizon."""
-    light = b.lit[b.pairs[r, 0]]
-    camera = b.seen[b.pairs[r, 1]]
-    square, fresnel = lobe_angles(r, index, b)
-    above = light > 0.0 and camera > 0.0
-    lobe.light[r] = light if above else 1.0
-    lobe.camera[r] = camera if above else 1.0
-    lobe.half[r] = min((light + camera) ** 2 / max(square, 1e-12), 1.0)
-    lobe.fresnel[r] = fresnel * light if above else 0.0
 
 
 @fast_kernel
@@ -128,24 +124,17 @@ def _write_values(count: int, alpha: float, lobe: Lobe) -> None:
 
 
 @fast_kernel
-def _sums(count: int, lobe: Lobe) -> tuple[float, float]:
-    """Weighted squares of the lobe, and its products with the targets."""
+def _decrease(count: int, alpha: float, lobe: Lobe) -> tuple[float, float]:
+    """Decrease of the squared differences by the best lobe of this roughness, and its
+    strength.
+    """
+    _write_values(count, alpha, lobe)
     square = 0.0
     product = 0.0
     for r in range(count):
         weighted = lobe.weight[r] * lobe.value[r]
         square += weighted * lobe.value[r]
         product += weighted * lobe.target[r]
-    return square, product
-
-
-@kernel
-def _decrease(count: int, alpha: float, lobe: Lobe) -> tuple[float, float]:
-    """Decrease of the squared differences by the best lobe of this roughness, and its
-    strength.
-    """
-    _write_values(count, alpha, lobe)
-    square, product = _sums(count, lobe)
     if square <= 0.0 or product <= 0.0:
         return 0.0, 0.0
     return product * product / square, product / square

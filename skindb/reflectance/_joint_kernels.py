@@ -247,20 +247,6 @@ def _write_turned(
 
 
 @kernel
-def _write_axes(n: Vector, axes: Matrix) -> None:
-    """Write two unit tangents (Duff et al. 2017)."""
-    sign = 1.0 if n[2] >= 0.0 else -1.0
-    a = -1.0 / (sign + n[2])
-    both = n[0] * n[1] * a
-    axes[0, 0] = 1.0 + sign * n[0] * n[0] * a
-    axes[0, 1] = sign * both
-    axes[0, 2] = -sign * n[0]
-    axes[1, 0] = both
-    axes[1, 1] = sign + n[1] * n[1] * a
-    axes[1, 2] = -n[1]
-
-
-@kernel
 def _turn(first: float, second: float, m: JointMemory) -> None:
     """Write to `m.turned` the normal, turned by small angles."""
     square = 0.0
@@ -276,12 +262,21 @@ def _write_derivatives(
     count: int, eta: float, square: Vector32, b: Lumitexel, m: JointMemory
 ) -> None:
     """Write the derivatives by the normal for the parameters `m.x`."""
-    _write_axes(m.normal, m.axes)
+    n = m.normal
+    sign = 1.0 if n[2] >= 0.0 else -1.0  # two unit tangents (Duff et al. 2017)
+    a = -1.0 / (sign + n[2])
+    both = n[0] * n[1] * a
+    m.axes[0, 0] = 1.0 + sign * n[0] * n[0] * a
+    m.axes[0, 1] = sign * both
+    m.axes[0, 2] = -sign * n[0]
+    m.axes[1, 0] = both
+    m.axes[1, 1] = sign + n[1] * n[1] * a
+    m.axes[1, 2] = -n[1]
     for k in range(2):
         _turn(DIFFERENCE * (1 - k), DIFFERENCE * k, m)
         _face(m.turned, eta, square, b, m)
         _write_turned(count, k, square, b, m)
-    _face(m.normal, eta, square, b, m)
+    _face(n, eta, square, b, m)
 
 
 @kernel
@@ -581,9 +576,23 @@ def _write_errors(
 
 
 @kernel
-def _sum_table(count: int, m: JointMemory) -> None:
-    """Write the Gram matrix of the table."""
+def _linearise(
+    s: int,
+    count: int,
+    wide: int,
+    block: Block,
+    lobes: Lobes,
+    o: Options,
+    b: Lumitexel,
+    m: JointMemory,
+    turned: bool,
+) -> None:
+    """Write the normal equations at `m.x`, those of the normal if it is turned."""
+    _write_weights(s, count, block, o, b, m)
+    if turned:
+        _write_derivatives(count, o.eta, lobes.square, b, m)
     gram(m.table, count, m.weight, m.none, m.moments, m.rest, m.block)
+    _write_equations(count, wide, lobes, b, m)
 
 
 @kernel
@@ -631,19 +640,12 @@ def _fit(
         if HALF_WIDTH * math.sqrt(lobes.square[wide]) < narrowest:
             break
         wide += 1
-    _write_weights(s, count, block, o, b, m)
-    _sum_table(count, m)
-    _write_equations(count, wide, lobes, b, m)
+    _linearise(s, count, wide, block, lobes, o, b, m, False)
     _solve_parameters(count, lobes, m)
     for _ in range(lobes.steps):
-        _write_weights(s, count, block, o, b, m)
-        _write_derivatives(count, o.eta, lobes.square, b, m)
-        _sum_table(count, m)
-        _write_equations(count, wide, lobes, b, m)
+        _linearise(s, count, wide, block, lobes, o, b, m, True)
         _turn_normal(s, count, lobes, o.eta, b, m)
-    _write_weights(s, count, block, o, b, m)
-    _sum_table(count, m)
-    _write_equations(count, wide, lobes, b, m)
+    _linearise(s, count, wide, block, lobes, o, b, m, False)
     out.samples[s] = count
     out.kkt[s] = _solve_parameters(count, lobes, m)
     _write_equations(count, wide, lobes, b, m)

@@ -635,27 +635,19 @@ def _add_squares(
 
 
 @kernel
-def relative_errors(n: int, b: Lumitexel) -> tuple[float, float]:
-    """RMS error over RMS of the first n samples, predicted in `b.scattered`, linear and in
-    cube-root space; NaN if they are zero.
+def add_surface(count: int, b: Lumitexel) -> tuple[float, float]:
+    """Add the surface in `b.surface` to the diffuse part of the samples; returns RMS error
+    over RMS of this prediction, linear and in cube-root space, NaN if samples are zero.
     """
     sums = np.zeros(4)
-    for c in range(3):
-        _add_squares(b.scattered[c][:n], b.sample[c][:n], np.float32(NO_FLOOR), sums)
-    if sums[1] > 0.0:
-        return math.sqrt(sums[0] / sums[1]), math.sqrt(sums[2] / sums[3])
-    return math.nan, math.nan
-
-
-@kernel
-def add_surface(count: int, b: Lumitexel) -> tuple[float, float]:
-    """Add the surface in `b.surface` to the diffuse part of the samples; returns the
-    relative errors of this prediction, linear and in cube-root space.
-    """
+    floor = np.float32(NO_FLOOR)
     for c in range(3):
         for r in range(count):
             b.scattered[c, r] += b.surface[r]
-    return relative_errors(count, b)
+        _add_squares(b.scattered[c][:count], b.sample[c][:count], floor, sums)
+    if sums[1] > 0.0:
+        return math.sqrt(sums[0] / sums[1]), math.sqrt(sums[2] / sums[3])
+    return math.nan, math.nan
 
 
 @kernel

@@ -38,6 +38,7 @@ from skindb.reflectance._lumitexel_kernels import (
     Lumitexel,
     block_memory,
     choose,
+    cosine_between,
     sample_status,
     surface_factor,
     tangents,
@@ -348,51 +349,6 @@ def _relative_slope(c: float, eta: float) -> float:
     )
 
 
-@fast_kernel
-def _turn_effect(
-    light: Matrix, camera: Matrix, n: int, b: Lumitexel, s: Separation, out: Matrix
-) -> None:
-    """Effect of rotations of the normal by one radian on the common part, and relative
-    effect on the channels' slopes.
-
-    First order: the pulls of the samples times the change of their prediction; out is
-    (2 axes, 2). `s.predicted` and `s.level` are the mixture of lobes and its derivative
-    with respect to theta_h; phi_d hardly affects lobes of isotropic materials.
-    """
-    mixed = s.predicted
-    bent = s.level
-    weight = s.x[SHAPE]
-    square = 0.0
-    out[:] = 0.0
-    for r in range(n):
-        i = b.pairs[r, 0]
-        o = b.pairs[r, 1]
-        wi_wo = (
-            b.to_light[i, 0] * b.to_camera[o, 0]
-            + b.to_light[i, 1] * b.to_camera[o, 1]
-            + b.to_light[i, 2] * b.to_camera[o, 2]
-        )
-        # cosine and sine of theta_h times the length of wi + wo
-        along = b.lit[i] + b.seen[o]
-        square_length = 2.0 + 2.0 * wi_wo
-        across = math.sqrt(
-            max(square_length - along * along, MIN_SINE * MIN_SINE * square_length)
-        )
-        tilt = bent[r] / across
-        shape = s.shape[r]
-        pull = s.pull[r]
-        square += shape * shape
-        for q in range(2):
-            closer = light[i, 2 * q] / b.lit[i]
-            body = shape * (closer + light[i, 2 * q + 1] + camera[o, 2 * q + 1])
-            bend = tilt * (light[i, 2 * q] + camera[o, 2 * q])
-            lobes = mixed[r] * closer - bend
-            out[q, 0] += pull * (weight * body + lobes)
-            out[q, 1] += shape * body
-    for q in range(2):
-        out[q, 1] /= max(square, 1e-12)
-
-
 @kernel
 def _add_by_device(
     index: IntMatrix32, moved: Vector32, n: int, by_light: Vector, by_camera: Vector
@@ -415,21 +371,48 @@ def _variance_of_sums(sums: Vector) -> float:
     return square * count / (count - 1.0) if count > 1 else 0.0
 
 
-@kernel
-def _normal_effect(
+@fast_kernel
+def _turn_effect(
     n: Vector, eta: float, count: int, b: Lumitexel, s: Separation
 ) -> Matrix:
-    """`_turn_effect` (2 axes, 2) of the mixture of lobes in `s.x`."""
+    """Effect of rotations of the normal by one radian on the common part, and relative
+    effect on the channels' slopes, (2 axes, 2).
+
+    First order: the pulls of the samples times the change of their prediction by the
+    mixture of lobes in `s.x`; phi_d hardly affects lobes of isotropic materials.
+    """
     axes = tangents(n)
-    moved = np.empty((2, 2))
-    lobes = s.x.copy()
-    lobes[SHAPE] = 0.0
-    _predict(b.rows, count, lobes, 0, s, s.predicted)
-    _predict(b.rows, count, lobes, COLUMNS, s, s.level)
     light = _slide(axes, eta, b.to_light, b.lit)
     camera = _slide(axes, eta, b.to_camera, b.seen)
-    _turn_effect(light, camera, count, b, s, moved)
-    return moved
+    mixed = s.predicted
+    bent = s.level  # derivative of the mixture with respect to theta_h
+    weight = s.x[SHAPE]
+    s.x[SHAPE] = 0.0
+    _predict(b.rows, count, s.x, 0, s, mixed)
+    _predict(b.rows, count, s.x, COLUMNS, s, bent)
+    square = 0.0
+    out = np.zeros((2, 2))
+    for r in range(count):
+        i = b.pairs[r, 0]
+        o = b.pairs[r, 1]
+        # cosine and sine of theta_h times the length of wi + wo
+        along = b.lit[i] + b.seen[o]
+        square_length = 2.0 + 2.0 * cosine_between(i, o, b)
+        across = math.sqrt(
+            max(square_length - along * along, MIN_SINE * MIN_SINE * square_length)
+        )
+        tilt = bent[r] / across
+        shape = s.shape[r]
+        square += shape * shape
+        for q in range(2):
+            closer = light[i, 2 * q] / b.lit[i]
+            body = shape * (closer + light[i, 2 * q + 1] + camera[o, 2 * q + 1])
+            bend = tilt * (light[i, 2 * q] + camera[o, 2 * q])
+            out[q, 0] += s.pull[r] * (weight * body + mixed[r] * closer - bend)
+            out[q, 1] += shape * body
+    for q in range(2):
+        out[q, 1] /= max(square, 1e-12)
+    return out
 
 
 @kernel
@@ -467,15 +450,15 @@ def _separate_channels(
 @kernel
 def _choose_crossed(b: Lumitexel) -> None:
     """Keep only the chosen samples behind crossed polarisers, if they are enough."""
+    limit = np.float32(MAX_GLOSS_CROSSED)
     count = 0
     for i in range(b.gloss.shape[0]):
         for o in range(b.gloss.shape[1]):
-            b.usable[i, o] = b.finite[i, o] and b.gloss[i, o] <= MAX_GLOSS_CROSSED
-            count += int(b.usable[i, o])
-    if count < MIN_SAMPLES_ALBEDO:
-        for i in range(b.gloss.shape[0]):
-            for o in range(b.gloss.shape[1]):
-                b.usable[i, o] = b.finite[i, o]
+            count += int(b.finite[i, o] and b.gloss[i, o] <= limit)
+    limit = limit if count >= MIN_SAMPLES_ALBEDO else np.float32(np.inf)
+    for i in range(b.gloss.shape[0]):
+        for o in range(b.gloss.shape[1]):
+            b.usable[i, o] = b.finite[i, o] and b.gloss[i, o] <= limit
 
 
 @kernel
@@ -517,7 +500,7 @@ def separate(
         b.rows[r, SHAPE] = s.shape[r]
     tint, variance, shared = _separate_channels(count, b, s, estimate)
     if turn[1] > 0.0:
-        moved = _normal_effect(n, eta, count, b, s)
+        moved = _turn_effect(n, eta, count, b, s)
         for q in range(2):
             for c in range(3):
                 by_turn = (moved[q, 0] + tint[c] * moved[q, 1]) ** 2

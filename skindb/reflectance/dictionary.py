@@ -199,11 +199,11 @@ def embedded_dictionary() -> Dictionary:
     return Dictionary(names, table, DEFAULT_GRID, EMBEDDED, exact=len(GRADED_NAMES))
 
 
-def sample_pairs(count: int = 20_000, lowest: float = 0.1) -> tuple[Array, Array]:
+def sample_pairs(count: int = 20_000) -> tuple[Array, Array]:
     """Fixed pairs of directions (n, 3), (n, 3), spread evenly over sqrt(theta_h),
     theta_d and phi_d.
 
-    Both cosines are above `lowest`, by default 6 degrees of elevation.
+    Both are more than 6 degrees above the horizon.
     """
     # Kronecker sequence of the root of x^4 = x + 1 (Roberts 2018)
     point = np.mod(
@@ -212,7 +212,7 @@ def sample_pairs(count: int = 20_000, lowest: float = 0.1) -> tuple[Array, Array
     wi, wo = directions(
         point[:, 0] ** 2 * np.pi / 2, point[:, 1] * np.pi / 2, point[:, 2] * np.pi
     )
-    up = np.minimum(wi[:, 2], wo[:, 2]) > lowest
+    up = np.minimum(wi[:, 2], wo[:, 2]) > 0.1
     return wi[up], wo[up]
 
 

@@ -256,11 +256,8 @@ def reduce_basis(
             str(k),
             "choose another k",
         )
-    chosen = good[
-        np.sort(
-            rng.choice(len(good), min(MAX_SAMPLED_SURFELS, len(good)), replace=False)
-        )
-    ]
+    count = min(MAX_SAMPLED_SURFELS, len(good))
+    chosen = good[np.sort(rng.choice(len(good), count, replace=False))]
     metric = brdf_metric(dictionary.table) if in_metric else None
     factors = nmf(
         weight[chosen].astype(np.float64), k, metric=metric, seeds=SEEDS, rng=rng
