@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
+from xarray import Dataset
 
 from skindb.types import Array, Mask
 
@@ -66,7 +66,7 @@ def legend_beside(ax: Axes) -> None:
 
 def intervals(
     ax: Axes,
-    table: xr.Dataset,
+    table: Dataset,
     name: str,
     places: Array,
     *,
@@ -87,7 +87,7 @@ def intervals(
 
 def significant_intervals(
     ax: Axes,
-    table: xr.Dataset,
+    table: Dataset,
     name: str,
     places: Array,
     is_significant: Mask,

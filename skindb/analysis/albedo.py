@@ -6,10 +6,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
+from xarray import Dataset
 
 from skindb import plots
 from skindb.analysis import texture
@@ -62,11 +62,11 @@ class Colours:
 
 
 def albedo_histograms(
-    cohort: xr.Dataset,
+    cohort: Dataset,
     *,
     regions: Sequence[str] = (FACE, "beard"),
-    drawn: xr.Dataset | None = None,
-) -> xr.Dataset:
+    drawn: Dataset | None = None,
+) -> Dataset:
     """Histograms of decorrelated colour for every take and region.
 
     The colour axes are the principal axes of the surfels of all takes, each take with
@@ -93,7 +93,7 @@ def albedo_histograms(
     """
     require_comparable(cohort, "surfels")
     takes = cohort["take"].values.tolist()
-    loaded = each_take(xr.Dataset.load, cohort, COLOUR_VARIABLES)
+    loaded = each_take(Dataset.load, cohort, COLOUR_VARIABLES)
     drawn = None if drawn is None else drawn.load()
     samples = [_colours(sample, drawn) for sample in loaded]
     mean, axes = _colour_axes(samples)
@@ -125,7 +125,7 @@ def albedo_histograms(
     )
 
 
-def _colours(take: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
+def _colours(take: Dataset, drawn: Dataset | None) -> Colours:
     """Sampled surfels of one take of a cohort, with the regions of its capture or those
     defined by landmarks.
     """
@@ -161,7 +161,7 @@ def _colours(take: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
     return Colours(colour, area, by_landmark | stored)
 
 
-def _masks(take: xr.Dataset, good: Mask) -> dict[str, Mask]:
+def _masks(take: Dataset, good: Mask) -> dict[str, Mask]:
     """Masks of the sampled surfels by region, for the regions that contain any."""
     if variables.REGION_MASK not in take:
         return {}
@@ -199,8 +199,8 @@ def _shared_edges(decorrelated: Sequence[Array]) -> Array:
 
 
 def albedo_table(
-    cohort: xr.Dataset, *, albedo: xr.Dataset, group_by: str | None = None
-) -> xr.Dataset:
+    cohort: Dataset, *, albedo: Dataset, group_by: str | None = None
+) -> Dataset:
     """Mean albedo and mean histogram of groups of takes.
 
     Parameters
@@ -288,9 +288,9 @@ def cumulative(fractions: Array) -> Array:
 
 
 def plot_albedo(
-    histograms: xr.Dataset,
+    histograms: Dataset,
     *,
-    table: xr.Dataset | None = None,
+    table: Dataset | None = None,
     axis: int = 0,
     region: str = FACE,
     ax: Axes | None = None,
@@ -313,30 +313,25 @@ def plot_albedo(
         part = histograms.sel(region=region)
         names = part["take"].values.tolist()
         lines = part[variables.ALBEDO_HISTOGRAM].isel(axis=axis).values
-    ax.set_prop_cycle(color=plots.CYCLE)
+    has_legend = len(names) <= MAX_LEGEND_ENTRIES
     for i, (name, fractions) in enumerate(zip(names, lines, strict=True)):
-        style = (
-            {"label": name}
-            if len(names) <= MAX_LEGEND_ENTRIES
-            else {"color": "0.4", "linewidth": 0.5}
-        )
-        ax.plot(
-            centres,
-            fractions.reshape(-1, width).sum(axis=1),
-            linestyle=LINES[i // len(plots.CYCLE) % len(LINES)],
-            **style,
-        )
-    if len(names) > MAX_LEGEND_ENTRIES:
-        ax.set_title(f"{len(names)} takes", fontsize=8)
-    else:
+        style: dict[str, Any] = {"color": "0.4", "linewidth": 0.5}
+        if has_legend:
+            style = {"label": name, "color": plots.CYCLE[i % len(plots.CYCLE)]}
+        joined = fractions.reshape(-1, width).sum(axis=1)
+        linestyle = LINES[i // len(plots.CYCLE) % len(LINES)]
+        ax.plot(centres, joined, linestyle=linestyle, **style)
+    if has_legend:
         plots.legend_beside(ax)
+    else:
+        ax.set_title(f"{len(names)} takes", fontsize=8)
     ax.set_xlabel(f"decorrelated colour, axis {axis} [standard deviations]")
     ax.set_ylabel("fraction of the area")
     ax.set_ylim(bottom=0)
     return ax
 
 
-def tabulate_albedo(table: xr.Dataset, histograms: xr.Dataset) -> Table:
+def tabulate_albedo(table: Dataset, histograms: Dataset) -> Table:
     """Header and one row per region and channel of every group, or of every take if
     they are not grouped.
     """

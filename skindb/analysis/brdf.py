@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 from dask.delayed import Delayed
+from numpy.random import Generator
+from xarray import Dataset
 
 from skindb import plots
 from skindb.analysis.study import (
@@ -36,7 +37,7 @@ from skindb.reflectance.reduction import Systems, factor_reflectance, residuals
 from skindb.reflectance.tables import TableGrid, brdf_metric
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
-from skindb.types import Array, Float32, Half, Index, dots, finite_rows, unit
+from skindb.types import Array, Float32, Index, dots, finite_rows, unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -72,13 +73,13 @@ MAX_FACTORED = 2000
 
 
 def population_basis(
-    cohort: xr.Dataset,
+    cohort: Dataset,
     *,
     tables: Array | Delayed,
     k: int = 6,
     in_metric: bool = False,
-    rng: np.random.Generator,
-) -> xr.Dataset:
+    rng: Generator,
+) -> Dataset:
     """Basis of `k` components for the sampled surfels of all takes: of a person, a set
     of conditions or a population.
 
@@ -154,9 +155,7 @@ def population_basis(
     )
 
 
-def _start_weights(
-    cohort: xr.Dataset, takes: Sequence[str], rng: np.random.Generator
-) -> Array:
+def _start_weights(cohort: Dataset, takes: Sequence[str], rng: Generator) -> Array:
     """Weights (n, m) of some surfels of every take; raises `InputError` for takes without
     fitted surfels.
     """
@@ -175,7 +174,7 @@ def _start_weights(
     return np.concatenate([rng.permutation(weights)[:part] for weights in starts])
 
 
-def _mean(take: xr.Dataset) -> Array:
+def _mean(take: Dataset) -> Array:
     """Area-weighted mean (m,) of the weights (n, m) of one take."""
     weights = take[variables.DICTIONARY_WEIGHT].values
     area = take[variables.SURFEL_AREA].values
@@ -189,12 +188,12 @@ def _mean(take: xr.Dataset) -> Array:
     )
 
 
-def _sums(take: xr.Dataset, H: Array, A: Array) -> Sums:
+def _sums(take: Dataset, H: Array, A: Array) -> Sums:
     """Sums of one take for H (k, m) in the metric A (m, m)."""
     return Sums.of(_fitted_weights(take), H, A)
 
 
-def _fitted_weights(take: xr.Dataset) -> Array:
+def _fitted_weights(take: Dataset) -> Array:
     """Weights (n, m) of the fitted surfels; a sample with fewer surfels than requested
     is padded with NaN.
     """
@@ -212,7 +211,7 @@ def project(weights: Array, H: Array, metric: Array) -> Array:
     return x
 
 
-def same_dictionary(cohort: xr.Dataset) -> list[str]:
+def same_dictionary(cohort: Dataset) -> list[str]:
     """Names of the BRDFs with which all takes were fitted; raises `InputError` if the
     dictionaries differ.
     """
@@ -231,13 +230,13 @@ def same_dictionary(cohort: xr.Dataset) -> list[str]:
 
 
 def basis_size_curve(
-    cohort: xr.Dataset,
+    cohort: Dataset,
     *,
     tables: Array | Delayed,
     ks: Sequence[int] = range(1, 13),
     tolerance: float = 0.01,
-    rng: np.random.Generator,
-) -> xr.Dataset:
+    rng: Generator,
+) -> Dataset:
     """Reconstruction error of reflectance as a function of the number of basis BRDFs.
 
     Bases of every size are computed from the reflectance of up to 2,000 of the sampled
@@ -320,7 +319,7 @@ def surfel_errors(systems: Systems, bases: Sequence[Array]) -> Array:
 
 
 def choose_size(
-    errors: Array, ks: Sequence[int], *, tolerance: float, rng: np.random.Generator
+    errors: Array, ks: Sequence[int], *, tolerance: float, rng: Generator
 ) -> tuple[Array, Array, Array, tuple[int, int]]:
     """Bounds of the smallest size on the plateau of the error.
 
@@ -369,7 +368,7 @@ def _first_on_plateau(ratios: Array, sizes: int, tolerance: float) -> int:
     return int(np.argmax((ratios[:sizes] <= 1 + tolerance) & (steepest <= 1 + STEP)))
 
 
-def tabulate_basis_size(curve: xr.Dataset) -> Table:
+def tabulate_basis_size(curve: Dataset) -> Table:
     """Header and rows of the table of `basis_size_curve`, one row per size.
 
     Parameters
@@ -392,7 +391,7 @@ def tabulate_basis_size(curve: xr.Dataset) -> Table:
     return list(TABLE_HEADER), [[k, *row] for k, row in zip(sizes, rows, strict=True)]
 
 
-def describe_basis_size(curve: xr.Dataset) -> str:
+def describe_basis_size(curve: Dataset) -> str:
     """Number of bases that are needed by `choose_size`, and the reason, in one or two sentences."""
     ks = curve["k"].values
     tolerance = f"{100 * float(curve[variables.PLATEAU_TOLERANCE]):.3g} %"
@@ -432,12 +431,12 @@ def _sizes(low: int, high: int) -> str:
     return str(low) if low == high else f"{low} to {high}"
 
 
-def _take_errors(take: xr.Dataset, tables: Array, bases: Sequence[Array]) -> Array:
+def _take_errors(take: Dataset, tables: Array, bases: Sequence[Array]) -> Array:
     """`surfel_errors` of all sampled surfels of one take."""
     return surfel_errors(_systems(take, tables, slice(None)), bases)
 
 
-def _systems(take: xr.Dataset, tables: Array, part: slice) -> Systems:
+def _systems(take: Dataset, tables: Array, part: slice) -> Systems:
     """Normal equations of the selected surfels of one take."""
     is_fitted = finite_rows(take[variables.DIFFUSE_REFLECTANCE].values)
     surfels = take.isel(surfel=np.flatnonzero(is_fitted)[part])
@@ -450,37 +449,27 @@ def _systems(take: xr.Dataset, tables: Array, part: slice) -> Systems:
     parts = []
     for start in range(0, max(surfels.sizes["surfel"], 1), BLOCK):
         block = surfels.isel(surfel=slice(start, start + BLOCK))
-        (rows, offsets), target = _surface_rows(
-            block[variables.REFLECTANCE_SAMPLE].values, block, block, tables, eta
-        )
-        parts.append(Systems.of(rows, offsets, target))
+        parts.append(Systems.of(*_surface_rows(block, tables, eta)))
     return Systems.joined(parts)
 
 
 def _surface_rows(
-    samples: Half,
-    dome: xr.Dataset,
-    fitted: xr.Dataset,
-    tables: Array,
-    eta: float,
-) -> tuple[tuple[Float32, Index], Array]:
+    surfels: Dataset, tables: Array, eta: float
+) -> tuple[Float32, Index, Array]:
     """Basis rows with their offsets, and the samples (total, 3) minus the diffuse term,
     for a few surfels.
     """
-    position, normal = (
-        fitted[n].values.astype(float)
-        for n in (variables.SURFEL_POSITION, variables.SHADING_NORMAL)
+    position = surfels[variables.SURFEL_POSITION].values[:, None].astype(float)
+    normal = surfels[variables.SHADING_NORMAL].values.astype(float)
+    to_light, to_camera = (
+        unit(surfels[name].values.astype(float) - position)
+        for name in (variables.LIGHT_POSITION, variables.CAMERA_POSITION)
     )
-    to_light = _directions(dome[variables.LIGHT_POSITION].values, position)
-    to_camera = _directions(dome[variables.CAMERA_POSITION].values, position)
-    values = samples.astype(float)
+    values = surfels[variables.REFLECTANCE_SAMPLE].values.astype(float)
+    grid = TableGrid(*tables.shape[:3])
+    is_known = finite_rows(values)
     rows, offsets, index = basis_rows(
-        tables,
-        TableGrid(*tables.shape[:3]),
-        normal,
-        to_light,
-        to_camera,
-        finite_rows(values),
+        tables, grid, normal, to_light, to_camera, is_known
     )
     surfel = np.repeat(np.arange(len(position)), np.diff(offsets))
     cos_i = dots(normal[surfel], to_light[surfel, index[:, 0]])
@@ -491,17 +480,11 @@ def _surface_rows(
         * fresnel_transmittance(cos_o, eta)
         / np.pi
     )
-    diffuse = even_diffuse(fitted).astype(float)[surfel] * passed[:, None]
-    return (rows, offsets), values[surfel, index[:, 0], index[:, 1]] - diffuse
+    diffuse = even_diffuse(surfels).astype(float)[surfel] * passed[:, None]
+    return rows, offsets, values[surfel, index[:, 0], index[:, 1]] - diffuse
 
 
-def _directions(points: Array, position: Array) -> Array:
-    """Unit directions (n, p, 3) from the surfels to the points."""
-    d = points[None].astype(float) - position[:, None]
-    return unit(d)
-
-
-def plot_basis_size(curve: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+def plot_basis_size(curve: Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot the error against k with its interval; the chosen size is marked."""
     ax = ax or plots.new_axes(6, 3.6)
     k = curve["k"].values

@@ -7,18 +7,20 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
+from xarray import Dataset
 
 from skindb import plots
 from skindb.optics.angles import half_difference
+from skindb.reflectance.sampling import tangents
 from skindb.reflectance.tables import lookup
 from skindb.schema import variables
-from skindb.types import AnyArray, Array, Float32, Mask, lengths
+from skindb.types import AnyArray, Array, Float32, Mask
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.projections.polar import PolarAxes
 
+VIEW = np.array([0.0, 0.0, 1.0])  # direction to the camera
 MARKERS = "osD^vP"
 LINES = ("-", "--")
 # angles of the lights from the viewing direction, upwards and to the right
@@ -32,7 +34,7 @@ MAX_EXITANCE = 80.0  # degrees; f rises towards the horizon and would hide the r
 GAMMA = 2.2
 
 
-def plot_brdf_space(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+def plot_brdf_space(space: Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot the map of the takes, coloured by group.
 
     Parameters
@@ -76,7 +78,7 @@ def plot_brdf_space(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def plot_group_spheres(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+def plot_group_spheres(space: Dataset, *, ax: Axes | None = None) -> Axes:
     """Render a sphere with the mean surface BRDF of each group, under a frontal and a
     grazing light, at equal exposure.
 
@@ -122,7 +124,7 @@ def plot_group_spheres(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def plot_group_lobes(space: xr.Dataset, *, ax: PolarAxes | None = None) -> PolarAxes:
+def plot_group_lobes(space: Dataset, *, ax: PolarAxes | None = None) -> PolarAxes:
     """Plot the lobes f cos(theta_i) [sr^-1] of the groups in the plane of incidence, at
     30 and 60 degrees of incidence.
 
@@ -174,7 +176,7 @@ def plot_group_lobes(space: xr.Dataset, *, ax: PolarAxes | None = None) -> Polar
     return ax
 
 
-def plot_space(space: xr.Dataset) -> Axes:
+def plot_space(space: Dataset) -> Axes:
     """Plot map, spheres and lobes in one figure, and return the axes of the map."""
     from matplotlib import pyplot
 
@@ -228,28 +230,20 @@ def _shaded(tables: AnyArray, normal: Array, light: Array) -> Array:
     """Values f cos(theta_i) (n, groups) for normals seen from the direction z; the BRDF
     is isotropic.
     """
-    view = np.array([0.0, 0.0, 1.0])
-    cos_i = normal @ light
-    cos_o = normal @ view
-    lit = cos_i > 0
-    out = np.zeros((len(normal), tables.shape[-1]))
-    n = normal[lit]
-    wi_z = cos_i[lit]
-    wo_z = cos_o[lit]
-    # local frame of the normal with the viewer in its x, z plane
-    tangent = view - wo_z[:, None] * n
-    length = lengths(tangent)[..., None]
-    tangent = np.where(
-        length > 1e-9, tangent / np.maximum(length, 1e-9), [1.0, 0.0, 0.0]
+    cosine = normal @ light
+    lit = cosine > 0
+    frame = (*tangents(normal[lit]), normal[lit])
+    to_light, to_camera = (
+        np.stack([axis @ direction for axis in frame], axis=-1)
+        for direction in (light, VIEW)
     )
-    second = np.cross(n, tangent)
-    wi = np.stack([tangent @ light, second @ light, wi_z], axis=-1)
-    wo = np.stack([tangent @ view, second @ view, wo_z], axis=-1)
-    out[lit] = lookup(tables, *half_difference(wi, wo)) * wi_z[:, None]
+    out = np.zeros((len(normal), tables.shape[-1]))
+    values = lookup(tables, *half_difference(to_light, to_camera))
+    out[lit] = values * cosine[lit][:, None]
     return out
 
 
-def _tables(space: xr.Dataset) -> Float32:
+def _tables(space: Dataset) -> Float32:
     """Tables (nh, nd, np, group) of `group_brdf`, without the last azimuth, which
     repeats the first.
     """

@@ -18,9 +18,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import xarray as xr
+from numpy.random import Generator
 from sklearn.decomposition import FastICA
 from sklearn.exceptions import ConvergenceWarning
+from xarray import Dataset
 
 from skindb import plots
 from skindb.analysis.components import mean_face
@@ -35,7 +36,13 @@ from skindb.analysis.study import (
     table_of,
 )
 from skindb.analysis.subjects import grouped
-from skindb.analysis.texture import COVERED, DARKEST, LEAST_COVERED, MAPPED
+from skindb.analysis.texture import (
+    COVERED,
+    DARKEST,
+    LEAST_COVERED,
+    MAPPED,
+    covered_fractions,
+)
 from skindb.errors import InputError, input_error, require
 from skindb.numerics.statistics import SUMMARY, Moments
 from skindb.parameters import group_option, seed_option
@@ -85,13 +92,11 @@ PUBLISHED = "published absorption"
 
 
 class _Sampled(NamedTuple):
-    """Texels of a take: -ln R_d (n, 3) minus its mean, the mean (3,), and the tile of
-    each texel (n,).
-    """
+    """Texels of a take."""
 
-    density: Array
-    mean: Array
-    tile: Array
+    density: Array  # (n, 3) -ln R_d minus its mean
+    mean: Array  # (3,)
+    tile: Array  # (n,) of each texel
 
 
 @dataclass(frozen=True)
@@ -105,11 +110,11 @@ class _Plane:
 
 
 def chromophore_axes(
-    cohort: xr.Dataset,
+    cohort: Dataset,
     *,
     landmarks: Mapping[str, Array] | None = None,
-    rng: np.random.Generator,
-) -> xr.Dataset:
+    rng: Generator,
+) -> Dataset:
     """Absorption vectors of melanin and haemoglobin, from the variation of albedo within takes.
 
     Differences between takes are excluded, because a chance correlation of melanin and
@@ -187,7 +192,7 @@ def chromophore_axes(
     )
 
 
-def _skin_samples(cohort: xr.Dataset, inside: Mask, count: int) -> list[_Sampled]:
+def _skin_samples(cohort: Dataset, inside: Mask, count: int) -> list[_Sampled]:
     """Samples of the skin of all takes that have any.
 
     Raises
@@ -218,7 +223,7 @@ def _skin_samples(cohort: xr.Dataset, inside: Mask, count: int) -> list[_Sampled
     return samples
 
 
-def chromophore_maps(maps: xr.Dataset, axes: xr.Dataset) -> xr.Dataset:
+def chromophore_maps(maps: Dataset, axes: Dataset) -> Dataset:
     """Maps of melanin and haemoglobin of one take.
 
     Parameters
@@ -244,23 +249,19 @@ def chromophore_maps(maps: xr.Dataset, axes: xr.Dataset) -> xr.Dataset:
     )
     return dataset(
         {
-            variables.TEXEL_CHROMOPHORE: np.where(
-                measured[..., None], amounts, np.nan
-            ).astype(np.float32),
-            variables.TEXEL_CHROMOPHORE_RESIDUAL: np.where(
-                measured, residual, np.nan
-            ).astype(np.float32),
+            variables.TEXEL_CHROMOPHORE: np.where(measured[..., None], amounts, np.nan),
+            variables.TEXEL_CHROMOPHORE_RESIDUAL: np.where(measured, residual, np.nan),
         },
         coords={"chromophore": CHROMOPHORES},
     )
 
 
 def chromophore_statistics(
-    cohort: xr.Dataset,
+    cohort: Dataset,
     *,
-    axes: xr.Dataset,
+    axes: Dataset,
     landmarks: Mapping[str, Array] | None = None,
-) -> xr.Dataset:
+) -> Dataset:
     """Mean and standard deviation of melanin and haemoglobin over the texels of every
     take and region.
 
@@ -303,8 +304,8 @@ def chromophore_statistics(
 
 
 def chromophore_table(
-    cohort: xr.Dataset, *, statistics: xr.Dataset, group_by: str | None = None
-) -> xr.Dataset:
+    cohort: Dataset, *, statistics: Dataset, group_by: str | None = None
+) -> Dataset:
     """Mean melanin and haemoglobin of groups of subjects, with Student's 95 % interval.
 
     Parameters
@@ -342,16 +343,15 @@ def chromophore_table(
     )
 
 
-def _density(maps: xr.Dataset) -> tuple[Array, Mask]:
+def _density(maps: Dataset) -> tuple[Array, Mask]:
     """-ln R_d (v, u, 3), 0 where nothing was measured, and the mask (v, u) of measured texels."""
     albedo = maps[variables.TEXEL_DIFFUSE_REFLECTANCE].values.astype(float)
     measured = (maps[variables.TEXEL_COVERAGE].values > COVERED) & finite_rows(albedo)
-    return -np.log(
-        np.maximum(np.where(measured[..., None], albedo, 1.0), DARKEST)
-    ), measured
+    known = np.where(measured[..., None], albedo, 1.0)
+    return -np.log(np.maximum(known, DARKEST)), measured
 
 
-def _sampled(maps: xr.Dataset, inside: Mask, count: int) -> _Sampled | None:
+def _sampled(maps: Dataset, inside: Mask, count: int) -> _Sampled | None:
     """Evenly spaced texels of the skin of one take; `count` texels, so that each take
     has the same weight.
     """
@@ -378,7 +378,7 @@ def _principal_plane(density: Array) -> _Plane:
 
 
 def _components(
-    samples: list[_Sampled], plane: _Plane, rng: np.random.Generator
+    samples: list[_Sampled], plane: _Plane, rng: Generator
 ) -> tuple[Array, Array]:
     """Independent components (2, 3), melanin first, and their RMS rotation [deg] in
     bootstrap samples.
@@ -402,7 +402,7 @@ def _components(
     return best, np.sqrt(np.mean(np.square(turned), axis=0))
 
 
-def _independent(density: Array, rng: np.random.Generator) -> Array:
+def _independent(density: Array, rng: Generator) -> Array:
     """Independent components (2, 3) in the principal plane, 1 in green; the one that
     absorbs more red is the first.
     """
@@ -418,17 +418,12 @@ def _independent(density: Array, rng: np.random.Generator) -> Array:
         tol=1e-5,
         random_state=int(rng.integers(2**31)),
     )
-    mixing = (axes @ _mixing_matrix(ica, white)).T
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        mixing = (axes @ ica.fit(white).mixing_).T
     green = mixing[:, 1:2]
     mixing = mixing / np.where(np.abs(green) > 1e-6, green, 1e-6)
     return np.asarray(mixing[np.argsort(-mixing[:, 0])])
-
-
-def _mixing_matrix(ica: FastICA, white: Array) -> Array:
-    """Mixing matrix of whitened densities, without warnings about convergence."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        return np.asarray(ica.fit(white).mixing_)
 
 
 def _rejection_reasons(mixing: Array, spread: Array, plane: _Plane) -> list[str]:
@@ -489,13 +484,13 @@ def _unmixed(density: Array, axes: Array, offset: Array) -> tuple[Array, Array]:
 
 
 def _statistics(
-    maps: xr.Dataset, masks: Array, axes: Array, offset: Array
+    maps: Dataset, masks: Mask, axes: Array, offset: Array
 ) -> tuple[Array, Array, Array, Array]:
     """Mean and standard deviation (region, chromophore), RMS residual (region,) and
     coverage (region,).
     """
     density, measured = _density(maps)
-    covered = np.array([(measured & mask).sum() / max(mask.sum(), 1) for mask in masks])
+    covered = covered_fractions(measured, masks)
     mean, deviation = np.full((2, len(masks), len(CHROMOPHORES)), np.nan)
     residuals = np.full(len(masks), np.nan)
     for r, mask in enumerate(masks):
@@ -503,11 +498,9 @@ def _statistics(
         if not (covered[r] >= LEAST_COVERED if r else measured.any()):
             continue
         amounts, residual = _unmixed(density[measured & mask], axes, offset)
-        mean[r], deviation[r], residuals[r] = (
-            amounts.mean(axis=0),
-            amounts.std(axis=0),
-            np.sqrt(np.mean(residual**2)),
-        )
+        mean[r] = amounts.mean(axis=0)
+        deviation[r] = amounts.std(axis=0)
+        residuals[r] = np.sqrt(np.mean(residual**2))
     return mean, deviation, residuals, covered
 
 
@@ -517,7 +510,7 @@ def _angle(a: Array, b: Array) -> Array:
     return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
-def describe_chromophores(axes: xr.Dataset) -> list[str]:
+def describe_chromophores(axes: Dataset) -> list[str]:
     """Origin of the axes and their angles to published absorption, one line each."""
     lines = [f"axes: {axes.attrs['axes_origin']}"]
     for name in CHROMOPHORES:
@@ -539,7 +532,7 @@ def describe_chromophores(axes: xr.Dataset) -> list[str]:
     return [*lines, *axes.attrs["flags"]]
 
 
-def plot_chromophores(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+def plot_chromophores(table: Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot mean melanin and haemoglobin of the groups in every region, with 95 % intervals."""
     regions = [name for name in table["region"].values.tolist() if name != "neck"]
     ax = ax or plots.new_axes(6.5, 1.4 + 0.55 * len(regions))

@@ -6,18 +6,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
+from xarray import DataArray, Dataset
 
 from skindb.analysis.study import (
     Population,
     Results,
     Study,
+    Table,
     each_take,
     shared_once,
     skipped_takes,
+    table_of,
 )
 from skindb.analysis.subjects import takes_to_compare
 from skindb.analysis.texture import COVERED
@@ -51,7 +53,7 @@ UNIT = {"units": "1", "long_name": "unit vector"}
 LEAST_KNOWN = 0.5
 
 
-def mean_face(cohort: xr.Dataset, *, min_subjects: int = LEAST_SUBJECTS) -> xr.Dataset:
+def mean_face(cohort: Dataset, *, min_subjects: int = LEAST_SUBJECTS) -> Dataset:
     """Mean and standard deviation over subjects of albedo, sigma_tr and surface
     reflectance, texel by texel.
 
@@ -88,23 +90,18 @@ def mean_face(cohort: xr.Dataset, *, min_subjects: int = LEAST_SUBJECTS) -> xr.D
     for subject in subjects.names:
         rows = np.flatnonzero(subjects.rows_of(subject))
         for name, values in _subject_maps(takes.isel(take=rows), names).items():
-            sums[name] = (
-                sums[name] + Moments.of(values[None])
-                if name in sums
-                else Moments.of(values[None])
-            )
+            moments = Moments.of(values[None])
+            sums[name] = sums[name] + moments if name in sums else moments
     maps: dict[str, Array] = {}
     for name, moments in sums.items():
         short, is_log = AVERAGED[name]
         enough = moments.count >= max(min_subjects, 1)
         mean = np.exp(moments.mean) if is_log else moments.mean
-        deviation = f"{short}_log_deviation" if is_log else f"{short}_deviation"
-        maps[short] = np.where(enough, mean, np.nan).astype(np.float32)
-        maps[deviation] = np.where(enough, moments.standard_deviation, np.nan).astype(
-            np.float32
-        )
-        count = moments.count.min(axis=-1) if moments.count.ndim == 3 else moments.count
-        maps[f"{short}_count"] = count.astype(np.int32)
+        kind = "log_deviation" if is_log else "deviation"
+        maps[short] = np.where(enough, mean, np.nan)
+        maps[f"{short}_{kind}"] = np.where(enough, moments.standard_deviation, np.nan)
+        count = moments.count.reshape(*moments.count.shape[:2], -1)
+        maps[f"{short}_count"] = count.min(axis=-1)
     require(
         any(np.isfinite(maps[AVERAGED[name][0]]).any() for name in names),
         "mean face",
@@ -124,7 +121,7 @@ def mean_face(cohort: xr.Dataset, *, min_subjects: int = LEAST_SUBJECTS) -> xr.D
     )
 
 
-def _subject_maps(takes: xr.Dataset, names: list[str]) -> dict[str, Array]:
+def _subject_maps(takes: Dataset, names: list[str]) -> dict[str, Array]:
     """Means of the maps over the takes of a subject, on the scale of averaging; NaN
     where nothing was measured.
     """
@@ -145,8 +142,8 @@ def _subject_maps(takes: xr.Dataset, names: list[str]) -> dict[str, Array]:
 
 
 def principal_components(
-    values: xr.DataArray, *, max_components: int = 10, least_known: float = LEAST_KNOWN
-) -> xr.Dataset:
+    values: DataArray, *, max_components: int = 10, least_known: float = LEAST_KNOWN
+) -> Dataset:
     """Mean, principal axes and scores of the takes of a cohort.
 
     Every take is read by its own tasks. The vectors of all takes are kept in memory in
@@ -197,7 +194,7 @@ def principal_components(
     ratio = axes.variance / (axes.total or 1.0)
     shape = tuple(cohort.sizes[dim] for dim in dims)
     units = values.attrs.get("units", "1")
-    ds = xr.Dataset(
+    ds = Dataset(
         {
             "mean": (dims, _expand(axes.mean, is_used, shape), {"units": units}),
             "axis": (
@@ -228,7 +225,7 @@ def principal_components(
 
 
 def _usable_entries(
-    cohort: xr.Dataset, least_known: float
+    cohort: Dataset, least_known: float
 ) -> tuple[Index, Mask, list[Note]]:
     """Rows of the takes with enough known entries, the entries that all of them know,
     and notes on the other takes.
@@ -266,12 +263,12 @@ def _usable_entries(
     return rows, is_used, skipped
 
 
-def _finite_entries(take: xr.Dataset) -> Bytes:
+def _finite_entries(take: Dataset) -> Bytes:
     """Mask of the known entries of a take, one bit each."""
     return np.packbits(np.isfinite(take["values"].values).ravel())
 
 
-def _used_entries(take: xr.Dataset, is_used: Mask) -> Array:
+def _used_entries(take: Dataset, is_used: Mask) -> Array:
     return np.asarray(take["values"].values.ravel()[is_used])
 
 
@@ -282,7 +279,7 @@ def _expand(values: Array, is_used: Mask, shape: tuple[int, ...]) -> Float64:
     return out.reshape(*values.shape[:-1], *shape)
 
 
-def face_components(cohort: xr.Dataset, *, max_components: int = 5) -> xr.Dataset:
+def face_components(cohort: Dataset, *, max_components: int = 5) -> Dataset:
     """Principal components of the albedo maps of a cohort, with the variable names of the store.
 
     Parameters
@@ -302,16 +299,15 @@ def face_components(cohort: xr.Dataset, *, max_components: int = 5) -> xr.Datase
     require_comparable(cohort, "maps")
     albedo = cohort[variables.TEXEL_DIFFUSE_REFLECTANCE]
     components = principal_components(albedo, max_components=max_components)
+    stored = {
+        variables.PRINCIPAL_MEAN: "mean",
+        variables.PRINCIPAL_AXIS: "axis",
+        variables.PRINCIPAL_SCORE: "score",
+        variables.PRINCIPAL_VARIANCE_RATIO: "explained_variance_ratio",
+        variables.PRINCIPAL_RESIDUAL: "residual",
+    }
     return dataset(
-        {
-            variables.PRINCIPAL_MEAN: components["mean"].values,
-            variables.PRINCIPAL_AXIS: components["axis"].values,
-            variables.PRINCIPAL_SCORE: components["score"].values,
-            variables.PRINCIPAL_VARIANCE_RATIO: components[
-                "explained_variance_ratio"
-            ].values,
-            variables.PRINCIPAL_RESIDUAL: components["residual"].values,
-        },
+        {name: components[source].values for name, source in stored.items()},
         coords={
             "take": components["take"].values.tolist(),
             "channel": CHANNELS,
@@ -323,38 +319,30 @@ def face_components(cohort: xr.Dataset, *, max_components: int = 5) -> xr.Datase
     )
 
 
-def tabulate_components(table: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
+def tabulate_components(table: Dataset) -> Table:
     """Header and one row per take with its scores and its residual."""
-    names = [f"score_{i + 1}" for i in range(table.sizes["component"])]
-    scores = table[variables.PRINCIPAL_SCORE].values
-    residuals = table[variables.PRINCIPAL_RESIDUAL].values
-    takes = table["take"].values.tolist()
-    rows = [
-        [take, *row, rest]
-        for take, row, rest in zip(
-            takes, scores.tolist(), residuals.tolist(), strict=True
-        )
-    ]
-    return ["take", *names, variables.PRINCIPAL_RESIDUAL], rows
+    scores = table[variables.PRINCIPAL_SCORE]
+    columns = {
+        f"score_{i + 1}": scores.isel(component=i)
+        for i in range(table.sizes["component"])
+    }
+    names = [*columns, variables.PRINCIPAL_RESIDUAL]
+    return table_of(table.assign(columns), names, ["take"])
 
 
-def describe_components(table: xr.Dataset) -> list[str]:
+def describe_components(table: Dataset) -> list[str]:
     """Fractions of the variance that the components explain, and what counts, one line each."""
-    ratios = ", ".join(
-        f"{ratio:.0%}" for ratio in table[variables.PRINCIPAL_VARIANCE_RATIO].values
-    )
-    fraction = f"{table.attrs['used_fraction']:.0%} of the texels, which all takes have"
-    lines = [
-        f"components explain {ratios} of the variance between "
-        f"{table.sizes['take']} takes ({fraction})"
-    ]
+    fractions = table[variables.PRINCIPAL_VARIANCE_RATIO].values
+    ratios = ", ".join(f"{fraction:.0%}" for fraction in fractions)
+    used = f"{table.attrs['used_fraction']:.0%} of the texels, which all takes have"
     return [
-        *lines,
+        f"components explain {ratios} of the variance between "
+        f"{table.sizes['take']} takes ({used})",
         "each take counts once, so that subjects with several takes count more",
     ]
 
 
-def plot_components(table: xr.Dataset, *, max_components: int = 3) -> Figure:
+def plot_components(table: Dataset, *, max_components: int = 3) -> Figure:
     """Plot the first axes as faces: the mean, and one standard deviation in both directions."""
     from matplotlib import pyplot
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import xarray as xr
+from numpy.random import Generator
+from xarray import Dataset
 
 from skindb.analysis.quantities import Quantities
 from skindb.analysis.subjects import (
@@ -19,7 +20,6 @@ from skindb.analysis.subjects import (
     Subjects,
     attribute_of,
     comparable_takes,
-    has_attribute,
     has_trait,
     multiple_correlation,
     require_adjustable,
@@ -85,10 +85,10 @@ class Contrast:
 
 
 def contrasts(
-    cohort: xr.Dataset,
+    cohort: Dataset,
     group_by: str,
     adjust: Sequence[str],
-    measure: Callable[[xr.Dataset], Quantities],
+    measure: Callable[[Dataset], Quantities],
 ) -> list[Contrast]:
     """Comparisons by an attribute of the quantities that `measure` computes from takes;
     see `group_effects`.
@@ -167,11 +167,10 @@ def _regressors(attribute: Attribute, group_by: str) -> dict[str, Array]:
 
 def _carriers(everyone: Subjects, subjects: Subjects, trait: str) -> dict[str, float]:
     """Subject -> 1 with and 0 without a trait, from its first take that is compared."""
-    usable = comparable_takes(subjects, trait) & has_attribute(subjects, trait)
     # of all takes, because the median age is that of all subjects
     of_take = dict(zip(everyone.take, has_trait(everyone, trait).tolist(), strict=True))
     carries: dict[str, float] = {}
-    for i in np.flatnonzero(usable):
+    for i in np.flatnonzero(comparable_takes(subjects, trait)):
         carries.setdefault(subjects.subject[i], float(of_take[subjects.take[i]]))
     return carries
 
@@ -187,14 +186,14 @@ class Comparison:
 
 
 def compare_groups(
-    cohort: xr.Dataset,
+    cohort: Dataset,
     group_by: str,
     adjust: Sequence[str],
-    measure: Callable[[xr.Dataset], Quantities],
+    measure: Callable[[Dataset], Quantities],
     *,
     permutations: int,
     min_fraction: float = 0.0,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> tuple[list[Comparison], list[Fault]]:
     """Comparisons with their tests, and a fault for each contrast that the subjects do
     not determine; arguments as of `contrasts` and `contrast_test`.
@@ -227,7 +226,7 @@ def compare_groups(
 
 
 def _paired(
-    cohort: xr.Dataset, group_by: str, measure: Callable[[xr.Dataset], Quantities]
+    cohort: Dataset, group_by: str, measure: Callable[[Dataset], Quantities]
 ) -> list[Contrast]:
     """Differences of each condition to normal, within the subjects who were measured in both."""
     subjects = subjects_of(cohort)
@@ -271,7 +270,7 @@ class ContrastTest:
 
 
 def contrast_test(
-    contrast: Contrast, permutations: int, min_fraction: float, rng: np.random.Generator
+    contrast: Contrast, permutations: int, min_fraction: float, rng: Generator
 ) -> ContrastTest:
     """Effects on the quantities that at least a fraction of the subjects has, NaN for
     others; raises `ValueError` where the subjects do not determine any.

@@ -7,8 +7,9 @@ from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
+from numpy.random import Generator
 from scipy import stats
+from xarray import Dataset
 
 from skindb import plots
 from skindb.analysis.quantities import SURFACE, Quantities, quantities_of
@@ -53,12 +54,12 @@ COLUMNS = (
 
 
 def component_correlations(
-    cohort: xr.Dataset,
+    cohort: Dataset,
     *,
     region: str = FACE,
     permutations: int = 10_000,
-    rng: np.random.Generator,
-) -> xr.Dataset:
+    rng: Generator,
+) -> Dataset:
     """Correlations between subjects of the three components of skin: albedo, surface
     reflectance and translucency.
 
@@ -155,7 +156,7 @@ def _components(quantities: Quantities, region: str) -> Array:
     return np.stack(out, axis=1)
 
 
-def _require_region(takes: xr.Dataset, region: str) -> None:
+def _require_region(takes: Dataset, region: str) -> None:
     """Raise `InputError` if no take has a region of this name."""
     if "region" in takes.coords and region not in takes["region"].values:
         raise input_error(
@@ -173,7 +174,7 @@ def _can_correlate(columns: Array) -> bool:
 
 
 def _pair(
-    two: Array, permutations: int, rng: np.random.Generator
+    two: Array, permutations: int, rng: Generator
 ) -> tuple[float, float, float, float, int]:
     """Correlation, ends of its interval, p value and number of subjects of two columns."""
     x, y = two[finite_rows(two)].T
@@ -212,14 +213,14 @@ def _pearson(x: Array, y: Array, axis: int = -1) -> Array:
     )
 
 
-def describe_correlations(table: xr.Dataset) -> list[str]:
+def describe_correlations(table: Dataset) -> list[str]:
     """Notes on the table, one line each."""
     differ = int((table[variables.CORRELATION_P_FALSE_DISCOVERY] < 0.05).sum())
     line = f"{differ} of {table.sizes['pair']} pairs are correlated (false discovery rate 5 %)"
     return [f"{line} in the region {table.attrs['region']}", *table.attrs["flags"]]
 
 
-def plot_correlations(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+def plot_correlations(table: Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot the correlations with their 95 % intervals, one row per pair."""
     names = table["pair"].values.tolist()
     ax = ax or plots.new_axes(6.5, 1.0 + 0.24 * len(names))
@@ -241,7 +242,7 @@ def plot_correlations(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def tabulate_correlations(table: xr.Dataset) -> Table:
+def tabulate_correlations(table: Dataset) -> Table:
     """Header and one row per pair."""
     return table_of(table, COLUMNS, ["pair"])
 

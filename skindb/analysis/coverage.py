@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 from scipy.stats.contingency import association
+from xarray import Dataset
 
 from skindb import plots
 from skindb.analysis.contrasts import ASSOCIATED, FEW
@@ -28,7 +28,7 @@ from skindb.analysis.subjects import (
 from skindb.errors import few_names, require
 from skindb.schema import IDENTIFIED, dataset, variables
 from skindb.schema.cohort import require_takes
-from skindb.types import Array
+from skindb.types import Array, Mask
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,7 +50,7 @@ MAX_VALUES = 12
 Factor = list[frozenset[str]]
 
 
-def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
+def coverage_report(cohort: Dataset) -> Dataset:
     """Numbers of subjects by gender, ancestry and age and their crossings, and by
     condition and probe site.
 
@@ -111,11 +111,11 @@ def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
     }
     return dataset(
         {
-            variables.COVERAGE_COUNT: np.array(list(counts.values()), np.int32),
+            variables.COVERAGE_COUNT: list(counts.values()),
             variables.COVERAGE_ASSOCIATION: between,
-            variables.COVERAGE_UNKNOWN: np.array(
-                [stated[name].values.count(None) for name in names], np.int32
-            ),
+            variables.COVERAGE_UNKNOWN: [
+                stated[name].values.count(None) for name in names
+            ],
         },
         coords={
             "cell": [AND.join(key) for key in counts],
@@ -133,7 +133,7 @@ def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
 
 
 def _factors(
-    cohort: xr.Dataset, takes: Subjects, stated: Mapping[str, Attribute]
+    cohort: Dataset, takes: Subjects, stated: Mapping[str, Attribute]
 ) -> dict[str, Factor]:
     """Factors by which subjects are counted: categorical attributes, age in decades,
     conditions and sites.
@@ -145,35 +145,21 @@ def _factors(
             factors[AGE_BAND] = _single(bands)
         elif not attribute.is_numeric and 1 <= len(attribute.words) <= MAX_VALUES:
             factors[name] = _single(attribute.values)
-    conditions: Sequence[object] = [NORMAL] * len(takes.take)
-    if CONDITION in takes.attributes:
-        conditions = takes.attributes[CONDITION].values
-    rows = [takes.rows_of(name) for name in takes.names]
+    conditions = takes.attribute(CONDITION).values
+    rows = [np.flatnonzero(takes.rows_of(name)) for name in takes.names]
     factors[CONDITION] = [
-        frozenset(
-            str(v)
-            for v in itertools.compress(conditions, rows_of_subject)
-            if v is not None
-        )
-        for rows_of_subject in rows
+        frozenset(str(conditions[i] or NORMAL) for i in of_subject)
+        for of_subject in rows
     ]
     if variables.SITE_STATUS in cohort:
-        good = (
-            cohort[variables.SITE_STATUS]
-            .isin(IDENTIFIED)
-            .transpose("take", "site", ...)
-            .values
+        good = cohort[variables.SITE_STATUS].isin(IDENTIFIED).any("channel")
+        measured: Mask = (
+            good.transpose("take", "site").values & takes.is_normal[:, None]
         )
-        measured = np.any(good.reshape(*good.shape[:2], -1), axis=-1)
-        measured = np.asarray(measured & takes.is_normal[:, None])
         sites = cohort["site"].values.tolist()
         factors[SITE] = [
-            frozenset(
-                itertools.compress(
-                    sites, np.any(measured[rows_of_subject], axis=0).tolist()
-                )
-            )
-            for rows_of_subject in rows
+            frozenset(itertools.compress(sites, np.any(measured[of_subject], axis=0)))
+            for of_subject in rows
         ]
     order = [*CROSSED, CONDITION, SITE]
     return {
@@ -358,7 +344,7 @@ def _cell_values(cell: tuple[str, ...]) -> str:
     return AND.join(part.partition(": ")[2] for part in cell)
 
 
-def describe_coverage(report: xr.Dataset) -> list[str]:
+def describe_coverage(report: Dataset) -> list[str]:
     """Numbers of subjects and takes, and the flags of a coverage report, one line each."""
     return [
         f"{report.attrs['subjects']} subjects, {len(report.attrs['takes'])} takes",
@@ -366,7 +352,7 @@ def describe_coverage(report: xr.Dataset) -> list[str]:
     ]
 
 
-def plot_coverage(report: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+def plot_coverage(report: Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot numbers of subjects by gender and ancestry against age as a table; empty
     cells are white.
     """

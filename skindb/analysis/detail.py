@@ -5,8 +5,8 @@
 import math
 
 import numpy as np
-import xarray as xr
 from scipy.ndimage import gaussian_filter
+from xarray import Dataset, DataTree
 
 from skindb.analysis.edit import surviving, with_albedo
 from skindb.analysis.regions import common_landmarks, map_regions
@@ -26,15 +26,15 @@ EDGE = 2.0  # mm, standard deviation of the Gaussian that blends the edge of the
 
 
 def transfer_detail(
-    model: xr.DataTree,
-    source: xr.DataTree,
+    model: DataTree,
+    source: DataTree,
     *,
-    registered: xr.Dataset,
-    source_registered: xr.Dataset,
+    registered: Dataset,
+    source_registered: Dataset,
     region: str | Mask = FACE,
     coarsest: float = COARSEST,
     size: int = SIZE,
-) -> xr.DataTree:
+) -> DataTree:
     """Copy of a model that has the fine albedo detail of another take within a region.
 
     The bands of the steerable pyramid of log albedo in the common (u, v), up to a
@@ -97,7 +97,7 @@ def transfer_detail(
         colour * np.exp(at_surfels(change, registered[variables.COMMON_UV].values)),
     )
     tree = model.copy()
-    tree["fitted"] = xr.DataTree(surviving(moved))
+    tree["fitted"] = DataTree(surviving(moved))
     edited = {
         "detail": str(source.attrs.get("take", "")),
         "region": region if isinstance(region, str) else "mask",
@@ -107,7 +107,7 @@ def transfer_detail(
     return tree
 
 
-def _require_same_landmarks(registered: xr.Dataset, source: xr.Dataset) -> None:
+def _require_same_landmarks(registered: Dataset, source: Dataset) -> None:
     """Raise `InputError` if two takes were not registered together."""
     require(
         np.array_equal(registered["landmark"].values, source["landmark"].values),
@@ -142,21 +142,15 @@ def _detail_change(image: Array, source: Array, fraction: Array, levels: int) ->
     """Change (v, u) of an image that replaces its finest levels by those of another
     image where `fraction` is 1.
     """
-    mine = build(image, levels)
-    theirs = build(source, levels)
-    parts = mine.parts()
-    source_parts = theirs.parts()
+    parts = build(source - image, levels)
     weights = level_fractions(fraction, [part.shape for part in parts])
-    steps: list[Image] = [
-        weight * (b - a)
-        for a, b, weight in zip(parts, source_parts, weights, strict=True)
-    ]
+    steps: list[Image] = [w * part for w, part in zip(weights, parts, strict=True)]
     steps[-1] = np.zeros_like(parts[-1])  # the low-pass residual of the face is kept
-    return reconstruct(mine.with_parts(steps))
+    return reconstruct(steps)
 
 
 def _region(
-    region: str | Mask, registered: xr.Dataset, source_registered: xr.Dataset, size: int
+    region: str | Mask, registered: Dataset, source_registered: Dataset, size: int
 ) -> Mask:
     if not isinstance(region, str):
         mask = np.asarray(region, bool)

@@ -4,12 +4,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import xarray as xr
+from xarray import DataArray, Dataset, DataTree
 
 from skindb.analysis.albedo import cumulative, decorrelate, histogram, quantiles
 from skindb.analysis.brdf import project
 from skindb.analysis.subjects import trait_name
-from skindb.analysis.texture import TextureEdit, at_surfels, edit_texture
+from skindb.analysis.texture import at_surfels, edit_texture
 from skindb.errors import Fault, InputError, input_error
 from skindb.numerics.texture import quantile_levels, valid_quantiles
 from skindb.optics.diffusion import dipole_s
@@ -35,17 +35,17 @@ NO_SUBJECT = "unknown: no subject was measured"
 
 
 def apply_traits(
-    model: xr.DataTree,
+    model: DataTree,
     *,
     amounts: Mapping[str, float],
-    traits: xr.Dataset,
-    basis: xr.Dataset,
-    albedo: xr.Dataset,
+    traits: Dataset,
+    basis: Dataset,
+    albedo: Dataset,
     tables: Array,
-    texture: xr.Dataset | None = None,
-    maps: xr.Dataset | None = None,
-    registered: xr.Dataset | None = None,
-) -> xr.DataTree:
+    texture: Dataset | None = None,
+    maps: Dataset | None = None,
+    registered: Dataset | None = None,
+) -> DataTree:
     """Edited copy of a model, moved along trait vectors.
 
     Parameters
@@ -112,28 +112,18 @@ def apply_traits(
     fitted, reports["brdf"] = _moved_surface(fitted, shift, basis, brdf_metric(tables))
     mixture = basis[variables.POPULATION_MIXTURE].values
     names = basis["dictionary"].values.tolist()
-    tree["basis"] = xr.DataTree(_common_basis(model, mixture, names, tables))
-    if (
-        texture is None
-        or maps is None
-        or registered is None
-        or TEXTURE_SHIFT not in traits
-    ):
-        shift = np.tensordot(amount, traits[variables.TRAIT_QUANTILE_SHIFT].values, 1)
-        fitted, reports["albedo"] = _moved_albedo(fitted, shift, albedo)
+    tree["basis"] = DataTree(_common_basis(model, mixture, names, tables))
+    shift = _texture_shift(amount, traits)
+    if texture is None or maps is None or registered is None or shift is None:
+        fitted, reports["albedo"] = _moved_albedo(fitted, amount, traits, albedo)
     else:
-        is_used = amount != 0
-        shifts = traits[TEXTURE_SHIFT].values[is_used].astype(float)
-        shift = np.tensordot(amount[is_used], shifts, 1)
-        edit = edit_texture(maps, shift, texture, rng=np.random.default_rng(0))
-        uv = registered[variables.COMMON_UV].values
         fitted, reports["albedo"] = _moved_texture(
-            fitted, shift, edit, uv, texture, albedo
+            fitted, shift, albedo, texture, maps, registered
         )
     if variables.SIGMA_TR in fitted:
         fitted, reports["translucency"] = _moved_sigma_tr(fitted, amount, traits)
         tree = _with_moved_sites(tree, amount, traits)
-    tree["fitted"] = xr.DataTree(surviving(fitted))
+    tree["fitted"] = DataTree(surviving(fitted))
     tree.attrs = take_attrs(model.attrs) | {
         "edit": dict(amounts),
         "edit_distance": max(report["from_nearest"] for report in reports.values()),
@@ -143,7 +133,7 @@ def apply_traits(
     return tree
 
 
-def _notes(traits: xr.Dataset, amount: Array) -> list[str]:
+def _notes(traits: Dataset, amount: Array) -> list[str]:
     """A line for each trait: its number of takes, or the warning of the study about it."""
     flagged = {flag.partition(": ")[0]: flag for flag in traits.attrs.get("flags", [])}
     notes = []
@@ -156,7 +146,7 @@ def _notes(traits: xr.Dataset, amount: Array) -> list[str]:
     return notes
 
 
-def _trait_amounts(amounts: Mapping[str, float], traits: xr.Dataset) -> Array:
+def _trait_amounts(amounts: Mapping[str, float], traits: Dataset) -> Array:
     """Amounts (trait,); raises `InputError` for unknown traits and for amounts that are
     not finite or too large.
     """
@@ -181,8 +171,8 @@ def _trait_amounts(amounts: Mapping[str, float], traits: xr.Dataset) -> Array:
 
 
 def _moved_surface(
-    fitted: xr.Dataset, shift: Array, basis: xr.Dataset, metric: Array
-) -> tuple[xr.Dataset, Report]:
+    fitted: Dataset, shift: Array, basis: Dataset, metric: Array
+) -> tuple[Dataset, Report]:
     """Refit the surface to the basis of the population, and move its mean coefficients
     (component,) by the shift.
     """
@@ -202,7 +192,7 @@ def _moved_surface(
     return _with_weights(fitted, moved), report
 
 
-def _projected(fitted: xr.Dataset, H: Array, metric: Array) -> Array:
+def _projected(fitted: Dataset, H: Array, metric: Array) -> Array:
     """Weights (n, k) of the surfels in a basis H (k, m); NaN without a fit."""
     weights = fitted[variables.DICTIONARY_WEIGHT].values.astype(float)
     good = finite_rows(weights)
@@ -211,13 +201,13 @@ def _projected(fitted: xr.Dataset, H: Array, metric: Array) -> Array:
     return projected
 
 
-def _with_weights(fitted: xr.Dataset, weights: Array) -> xr.Dataset:
+def _with_weights(fitted: Dataset, weights: Array) -> Dataset:
     """The surface with weights in another basis, which has other components."""
     rest = fitted.drop_dims("component")
     return rest.assign(basis_weight=label(variables.BASIS_WEIGHT, weights))
 
 
-def _mean(fitted: xr.Dataset, values: Array) -> Array:
+def _mean(fitted: Dataset, values: Array) -> Array:
     """Area-weighted mean (...) of values (n, ...) over the surfels that have any."""
     good = finite_rows(values)
     area = fitted[variables.SURFEL_AREA].values[good].astype(float)
@@ -225,8 +215,8 @@ def _mean(fitted: xr.Dataset, values: Array) -> Array:
 
 
 def with_basis(
-    model: xr.DataTree, *, mixture: Array, names: Sequence[str], tables: Array
-) -> xr.DataTree:
+    model: DataTree, *, mixture: Array, names: Sequence[str], tables: Array
+) -> DataTree:
     """Copy of a model whose surface is the nearest non-negative mixture of other basis
     BRDFs (figure 7).
 
@@ -245,15 +235,15 @@ def with_basis(
     fitted = model["fitted"].to_dataset().load()
     tree = model.copy()
     weights = _projected(fitted, float64(mixture), brdf_metric(tables))
-    tree["basis"] = xr.DataTree(_common_basis(model, mixture, names, tables))
-    tree["fitted"] = xr.DataTree(surviving(_with_weights(fitted, weights)))
+    tree["basis"] = DataTree(_common_basis(model, mixture, names, tables))
+    tree["fitted"] = DataTree(surviving(_with_weights(fitted, weights)))
     tree.attrs = take_attrs(model.attrs)
     return tree
 
 
 def _common_basis(
-    model: xr.DataTree, mixture: Array, names: Sequence[str], tables: Array
-) -> xr.Dataset:
+    model: DataTree, mixture: Array, names: Sequence[str], tables: Array
+) -> Dataset:
     brdf = stored_brdf(tables @ mixture.T.astype(np.float32))
     source = model["basis"].attrs.get("dictionary")
     return dataset(
@@ -267,20 +257,30 @@ def _common_basis(
     )
 
 
+def _texture_shift(amount: Array, traits: Dataset) -> Array | None:
+    """Shift of the quantiles of textures; None if the study has none."""
+    if TEXTURE_SHIFT not in traits:
+        return None
+    is_used = amount != 0
+    shifts = traits[TEXTURE_SHIFT].values[is_used].astype(float)
+    return np.asarray(np.tensordot(amount[is_used], shifts, 1))
+
+
 def _moved_texture(
-    fitted: xr.Dataset,
+    fitted: Dataset,
     shift: Array,
-    edit: TextureEdit,
-    uv: Array,
-    texture: xr.Dataset,
-    albedo: xr.Dataset,
-) -> tuple[xr.Dataset, Report]:
-    """Apply a change of the map, by shifts of the distributions of log albedo and of its
-    bands, to the surfels at common texture coordinates (n, 2).
+    albedo: Dataset,
+    texture: Dataset,
+    maps: Dataset,
+    registered: Dataset,
+) -> tuple[Dataset, Report]:
+    """Shift the distributions of log albedo and of its bands in the map, and apply the
+    change to the surfels.
     """
+    edit = edit_texture(maps, shift, texture, rng=np.random.default_rng(0))
     colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(float)
-    target = colour * np.exp(at_surfels(edit.change, uv))
-    moved, report = _with_albedo(fitted, target, albedo)
+    change = at_surfels(edit.change, registered[variables.COMMON_UV].values)
+    moved, report = _with_albedo(fitted, colour * np.exp(change), albedo)
     # requested change of the mean of the whole face, like the other values of the report
     region = texture["region"].values.tolist().index(FACE)
     step = (
@@ -297,7 +297,7 @@ def _moved_texture(
     return moved, report
 
 
-def with_albedo(fitted: xr.Dataset, albedo: Array) -> xr.Dataset:
+def with_albedo(fitted: Dataset, albedo: Array) -> Dataset:
     """A fitted surface with new albedos (n, 3), limited to physical values."""
     colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(float)
     out = np.where(albedo == colour, colour, np.clip(albedo, DARKEST, BRIGHTEST))
@@ -309,8 +309,8 @@ def with_albedo(fitted: xr.Dataset, albedo: Array) -> xr.Dataset:
 
 
 def _with_albedo(
-    fitted: xr.Dataset, target: Array, albedo: xr.Dataset
-) -> tuple[xr.Dataset, Report]:
+    fitted: Dataset, target: Array, albedo: Dataset
+) -> tuple[Dataset, Report]:
     """The fitted surface with new albedos (n, 3), and the report of the change."""
     moved = with_albedo(fitted, target)
     colour, out = (
@@ -328,16 +328,17 @@ def _with_albedo(
     return moved, report
 
 
-def _fraction(fitted: xr.Dataset, cut: Mask, values: Array) -> float:
+def _fraction(fitted: Dataset, cut: Mask, values: Array) -> float:
     """Fraction of the area of the surfels with values (n, 3) in which any is cut."""
     is_cut = np.where(finite_rows(values), cut.any(axis=1), np.nan)
     return float(_mean(fitted, is_cut[:, None])[0])
 
 
 def _moved_albedo(
-    fitted: xr.Dataset, shift: Array, albedo: xr.Dataset
-) -> tuple[xr.Dataset, Report]:
+    fitted: Dataset, amount: Array, traits: Dataset, albedo: Dataset
+) -> tuple[Dataset, Report]:
     """Shift the quantiles of albedo by the shift of the whole face."""
+    shift = np.tensordot(amount, traits[variables.TRAIT_QUANTILE_SHIFT].values, 1)
     colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(float)
     good = finite_rows(colour)
     mean, axes, edges = (
@@ -375,8 +376,8 @@ def _moved_albedo(
 
 
 def _moved_sigma_tr(
-    fitted: xr.Dataset, amount: Array, traits: xr.Dataset
-) -> tuple[xr.Dataset, Report]:
+    fitted: Dataset, amount: Array, traits: Dataset
+) -> tuple[Dataset, Report]:
     """Scale sigma_tr; traits without a measured shift are not applied, and the report
     names them.
     """
@@ -392,16 +393,14 @@ def _moved_sigma_tr(
     return fitted.assign(sigma_tr=label(variables.SIGMA_TR, np.exp(after))), report
 
 
-def surviving(ds: xr.Dataset) -> xr.Dataset:
+def surviving(ds: Dataset) -> Dataset:
     """The variables that an edit changes or that stay valid; errors, residuals and
     weights belong to the unedited model.
     """
     return ds[[name for name in names_of(Use.SURVIVES_EDIT) if name in ds]]
 
 
-def _with_moved_sites(
-    tree: xr.DataTree, amount: Array, traits: xr.Dataset
-) -> xr.DataTree:
+def _with_moved_sites(tree: DataTree, amount: Array, traits: Dataset) -> DataTree:
     """The model without the measurements of the probe, and with probe sites whose
     sigma_tr is scaled like the map; errors are omitted, as they do not include those of
     the vector.
@@ -413,11 +412,11 @@ def _with_moved_sites(
         scaled = sites[variables.SITE_SIGMA_TR].values.astype(float) * np.exp(log)
         moved = label(variables.SITE_SIGMA_TR, np.clip(scaled, *SIGMA_TR_RANGE))
         kept = surviving(sites).drop_attrs(deep=False)
-        tree["translucency"] = xr.DataTree(kept.assign(site_sigma_tr=moved))
+        tree["translucency"] = DataTree(kept.assign(site_sigma_tr=moved))
     return tree
 
 
-def _log_shift(amount: Array, traits: xr.Dataset) -> tuple[Array, Mask]:
+def _log_shift(amount: Array, traits: Dataset) -> tuple[Array, Mask]:
     """Shift of log sigma_tr (channel,), and the mask (trait,) of the traits with a
     measured shift.
     """
@@ -429,7 +428,7 @@ def _log_shift(amount: Array, traits: xr.Dataset) -> tuple[Array, Mask]:
 def _report(
     requested: Array,
     applied: Array,
-    takes: xr.DataArray,
+    takes: DataArray,
     now: Array,
     before: Array,
     metric: Array,

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 from scipy import stats
 from scipy.special import gammaln
+from xarray import Dataset
 
 from skindb import plots
 from skindb.analysis.contrasts import (
@@ -58,13 +58,13 @@ COLUMNS = (
 
 
 def group_effects(
-    cohort: xr.Dataset,
+    cohort: Dataset,
     *,
     group_by: str,
     adjust: Sequence[str] = (),
     permutations: int = 10_000,
     rng: np.random.Generator,
-) -> xr.Dataset:
+) -> Dataset:
     """Differences between groups of subjects in all measured quantities.
 
     Subjects are compared in the condition normal, each with the mean of its takes.
@@ -260,7 +260,7 @@ def _surface_flag(contrast: Contrast, statistics: dict[str, Array]) -> list[str]
     return [f"{contrast.name}: the surface reflectance differs as well; {note}"]
 
 
-def describe_group_effects(table: xr.Dataset) -> list[str]:
+def describe_group_effects(table: Dataset) -> list[str]:
     """Numbers of significant effects, detectable effects and flags of the comparisons,
     one line each.
     """
@@ -287,7 +287,7 @@ def describe_group_effects(table: xr.Dataset) -> list[str]:
     return [*lines, interval, adjusted, *table.attrs["flags"]]
 
 
-def _test_summary(part: xr.Dataset, count: int, smallest_p: float) -> str:
+def _test_summary(part: Dataset, count: int, smallest_p: float) -> str:
     """Adjustment, permutations and subjects of a comparison."""
     held = ", ".join(part.attrs["adjust"])
     subjects = int(part[variables.EFFECT_COUNT].sum("side").max())
@@ -300,7 +300,7 @@ def _test_summary(part: xr.Dataset, count: int, smallest_p: float) -> str:
     )
 
 
-def _detectable_line(name: str, part: xr.Dataset) -> list[str]:
+def _detectable_line(name: str, part: Dataset) -> list[str]:
     """A line with the smallest detectable differences, if any is known."""
     detectable = [
         f"{quantity} {_amount(value, quantity in part.attrs['logarithmic'])}"
@@ -321,7 +321,7 @@ def _amount(value: float, is_log: bool) -> str:
     return f"{100 * np.expm1(value):.0f} %" if is_log else f"{value:.2g}"
 
 
-def plot_group_effects(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+def plot_group_effects(table: Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot effects with their 95 % intervals in standard deviations between subjects,
     one row per quantity.
     """
@@ -363,7 +363,7 @@ def plot_group_effects(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def tabulate_group_effects(table: xr.Dataset) -> Table:
+def tabulate_group_effects(table: Dataset) -> Table:
     """Header and one row per comparison and quantity."""
     counts = {
         f"subjects_{side}": table[variables.EFFECT_COUNT].sel(side=side, drop=True)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
+from xarray import DataArray, Dataset
 
 from skindb.analysis.contrasts import Comparison, compare_groups, contrast_arguments
 from skindb.analysis.groups import SIGNIFICANT
@@ -46,7 +47,7 @@ SHOWN = ("R_d G", SURFACE, "sigma_tr G")
 
 
 def effect_maps(
-    cohort: xr.Dataset,
+    cohort: Dataset,
     *,
     group_by: str,
     adjust: Sequence[str] = (),
@@ -54,7 +55,7 @@ def effect_maps(
     permutations: int = PERMUTATIONS,
     min_fraction: float = MIN_FRACTION,
     rng: np.random.Generator,
-) -> xr.Dataset:
+) -> Dataset:
     """Effect of an attribute on albedo, surface reflectance and log sigma_tr at every
     texel, adjusted for others.
 
@@ -92,31 +93,16 @@ def effect_maps(
     require_comparable(cohort, "maps")
     adjust = (adjust,) if isinstance(adjust, str) else tuple(adjust)
     _require_divisor(size, cohort.sizes["v"])
-    parts: list[xr.Dataset] = []
-    flags: list[str] = []
-    faults: list[Fault] = []
-    for quantity in [quantity for quantity in QUANTITIES if quantity.mapped in cohort]:
-        compared, undetermined = compare_groups(
-            cohort,
-            group_by,
-            adjust,
-            partial(_texel_quantities, quantity=quantity, size=size),
-            permutations=permutations,
-            min_fraction=min_fraction,
-            rng=rng,
-        )
-        flags += [flag for comparison in compared for flag in comparison.flags]
-        name = quantity.name
-        faults += [replace(f, where=f"{f.where}, {name}") for f in undetermined]
-        if not compared:
-            continue
-        maps = _arranged(compared, cohort[quantity.mapped], name, size)
-        if parts and not maps["contrast"].equals(parts[0]["contrast"]):
-            # a contrast is missing for this variable only
-            rule = "every comparison must have texels"
-            faults.append(Fault(name, rule, "none for some", "exclude takes"))
-        else:
-            parts.append(maps)
+    compare = partial(
+        compare_groups,
+        cohort,
+        group_by,
+        adjust,
+        permutations=permutations,
+        min_fraction=min_fraction,
+        rng=rng,
+    )
+    parts, flags, faults = _quantity_maps(cohort, size, compare)
     if not parts:
         cure = "fit or register more takes"
         nothing = Fault("maps", "some texels must be measured", "none", cure)
@@ -137,9 +123,36 @@ def effect_maps(
     )
 
 
+def _quantity_maps(
+    cohort: Dataset,
+    size: int,
+    compare: Callable[..., tuple[list[Comparison], list[Fault]]],
+) -> tuple[list[Dataset], list[str], list[Fault]]:
+    """Maps of the quantities with the same comparisons, and flags and faults of all."""
+    parts: list[Dataset] = []
+    flags: list[str] = []
+    faults: list[Fault] = []
+    for quantity in [quantity for quantity in QUANTITIES if quantity.mapped in cohort]:
+        measure = partial(_texel_quantities, quantity=quantity, size=size)
+        compared, undetermined = compare(measure)
+        flags += [flag for comparison in compared for flag in comparison.flags]
+        name = quantity.name
+        faults += [replace(f, where=f"{f.where}, {name}") for f in undetermined]
+        if not compared:
+            continue
+        maps = _arranged(compared, cohort[quantity.mapped], name, size)
+        if parts and not maps["contrast"].equals(parts[0]["contrast"]):
+            # a contrast is missing for this variable only
+            rule = "every comparison must have texels"
+            faults.append(Fault(name, rule, "none for some", "exclude takes"))
+        else:
+            parts.append(maps)
+    return parts, flags, faults
+
+
 def _arranged(
-    compared: Sequence[Comparison], values: xr.DataArray, name: str, size: int
-) -> xr.Dataset:
+    compared: Sequence[Comparison], values: DataArray, name: str, size: int
+) -> Dataset:
     """Statistics (contrast, quantity, v, u) of comparisons of the texels of a variable,
     of which each channel is a quantity.
     """
@@ -181,16 +194,14 @@ def _require_divisor(size: int, texels: int) -> None:
         )
 
 
-def _texel_quantities(
-    takes: xr.Dataset, *, quantity: Quantity, size: int
-) -> Quantities:
+def _texel_quantities(takes: Dataset, *, quantity: Quantity, size: int) -> Quantities:
     """Values of a quantity at every texel (and channel) of every take, as quantities."""
     names = [quantity.mapped, variables.TEXEL_COVERAGE]
     values = np.stack(each_take(_block_means, takes, names, quantity, size))
     return Quantities(values, tuple(map(str, takes["subject"].values)))
 
 
-def _block_means(take: xr.Dataset, quantity: Quantity, size: int) -> Array:
+def _block_means(take: Dataset, quantity: Quantity, size: int) -> Array:
     """Means (size * size * channels,) of the measured texels in blocks of texels; NaN
     where too few were measured.
     """
@@ -207,7 +218,7 @@ def _block_means(take: xr.Dataset, quantity: Quantity, size: int) -> Array:
     return np.where(covered, mean, np.nan).astype(np.float32).ravel()
 
 
-def tabulate_effect_maps(maps: xr.Dataset) -> Table:
+def tabulate_effect_maps(maps: Dataset) -> Table:
     """Header and one row per comparison and quantity: texels, fraction that differs,
     mean and largest effect.
     """
@@ -233,7 +244,7 @@ def tabulate_effect_maps(maps: xr.Dataset) -> Table:
     return table_of(maps.assign(columns), list(columns), ("contrast", "quantity"))
 
 
-def describe_effect_maps(maps: xr.Dataset) -> list[str]:
+def describe_effect_maps(maps: Dataset) -> list[str]:
     """Notes on the table, one line each."""
     counts = zip(
         maps["contrast"].values.tolist(), maps.attrs["permutations"], strict=True
@@ -245,7 +256,7 @@ def describe_effect_maps(maps: xr.Dataset) -> list[str]:
     return [*lines, *maps.attrs["flags"]]
 
 
-def plot_effect_maps(maps: xr.Dataset, *, contrast: str | None = None) -> Figure:
+def plot_effect_maps(maps: Dataset, *, contrast: str | None = None) -> Figure:
     """Plot maps of the effect, of the half-width of its 95 % interval and of the number
     of subjects.
 
@@ -280,34 +291,36 @@ def plot_effect_maps(maps: xr.Dataset, *, contrast: str | None = None) -> Figure
     return figure
 
 
-def _plot_quantity(line: Sequence[Axes], maps: xr.Dataset) -> None:
+def _plot_quantity(line: Sequence[Axes], maps: Dataset) -> None:
     """Plot effect, half-width and number of subjects of one quantity on three axes."""
     quantity = str(maps["quantity"].values)
     is_logarithm = quantity in maps.attrs["logarithmic"]
     unit = "change of the logarithm" if is_logarithm else "difference"
-    effect = maps[variables.MAP_EFFECT].values
-    half_width = maps[variables.MAP_EFFECT_HALF_WIDTH].values
-    is_known = np.isfinite(maps[variables.MAP_EFFECT_P].values)
+    maps = maps.where(maps[variables.MAP_EFFECT_P].notnull())
+    size = abs(maps[variables.MAP_EFFECT])
+    half_width = maps[variables.MAP_EFFECT_HALF_WIDTH]
     largest, widest = (
-        float(np.quantile(values[is_known], SHOWN_FRACTION))
-        for values in (np.abs(effect), half_width)
+        float(values.quantile(SHOWN_FRACTION)) for values in (size, half_width)
     )
     largest = max(largest, 1e-12)
-    count = np.where(is_known, maps[variables.MAP_EFFECT_COUNT].values, np.nan)
     diverging = {"cmap": "RdBu_r", "vmin": -largest, "vmax": largest}
     from_zero = {"cmap": "cividis", "vmin": 0.0, "vmax": widest}
-    images: list[tuple[Array, dict[str, Any], str, str]] = [
-        (effect, diverging, f"effect on {quantity}", unit),
-        (half_width, from_zero, "half-width of the 95 % CI", unit),
-        (count, {"cmap": "cividis"}, "subjects", "n"),
+    images: list[tuple[str, dict[str, Any], str, str]] = [
+        (variables.MAP_EFFECT, diverging, f"effect on {quantity}", unit),
+        (
+            variables.MAP_EFFECT_HALF_WIDTH,
+            from_zero,
+            "half-width of the 95 % CI",
+            unit,
+        ),
+        (variables.MAP_EFFECT_COUNT, {"cmap": "cividis"}, "subjects", "n"),
     ]
-    for ax, (values, options, title, label) in zip(line, images, strict=True):
-        image = ax.imshow(values, interpolation="none", **options)
+    for ax, (name, options, title, label) in zip(line, images, strict=True):
+        image = ax.imshow(maps[name], interpolation="none", **options)
         ax.figure.colorbar(image, ax=ax, shrink=0.8, label=label)
         ax.set(title=title, xticks=[], yticks=[])
         ax.title.set_fontsize(8)
-    p = np.nan_to_num(maps[variables.MAP_EFFECT_P_ADJUSTED].values, nan=1.0)
-    differ = p < SIGNIFICANT
+    differ = maps[variables.MAP_EFFECT_P_ADJUSTED].values < SIGNIFICANT
     if differ.any() and not differ.all():
         line[0].contour(differ, levels=[0.5], colors="black", linewidths=0.6)
 

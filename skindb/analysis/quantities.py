@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import xarray as xr
+from xarray import DataArray, Dataset
 
 from skindb.analysis.subjects import level_error
 from skindb.errors import require
@@ -90,12 +90,12 @@ class Quantities:
         return replace(self, values=self.values[rows], subject=subject)
 
 
-def trusted(takes: xr.Dataset, variable: str) -> xr.DataArray:
+def trusted(takes: Dataset, variable: str) -> DataArray:
     """A variable of probe sites; NaN where the profile does not determine sigma_tr."""
     return takes[variable].where(takes[variables.SITE_STATUS].isin(IDENTIFIED))
 
 
-def quantities_of(cohort: xr.Dataset) -> Quantities:
+def quantities_of(cohort: Dataset) -> Quantities:
     """Albedo and surface reflectance of regions and log sigma_tr of probe sites, for every take.
 
     Parameters
@@ -117,7 +117,7 @@ def quantities_of(cohort: xr.Dataset) -> Quantities:
         if quantity.tabulated not in tables:
             continue
         is_site = "site" in quantity.dims
-        select = trusted if is_site else xr.Dataset.__getitem__
+        select = trusted if is_site else Dataset.__getitem__
         table = select(tables, quantity.tabulated).transpose("take", *quantity.dims)
         values = quantity.compared(float64(table.values)).reshape(len(table), -1)
         labels = [

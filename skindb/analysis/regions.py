@@ -9,7 +9,8 @@ from collections.abc import Mapping
 from functools import cache
 
 import numpy as np
-import xarray as xr
+from skimage.measure import points_in_poly
+from xarray import Dataset, DataTree
 
 from skindb.files import package_json
 from skindb.schema import variables
@@ -80,7 +81,7 @@ def map_regions(landmarks: Mapping[str, Array], size: int) -> dict[str, Mask]:
     return {name: mask.reshape(size, size) for name, mask in masks.items()}
 
 
-def common_landmarks(registered: Mapping[str, xr.Dataset]) -> dict[str, Array]:
+def common_landmarks(registered: Mapping[str, Dataset]) -> dict[str, Array]:
     """Mean positions (2,) of the landmarks in the common (u, v), each over the takes
     that have it.
     """
@@ -95,7 +96,7 @@ def common_landmarks(registered: Mapping[str, xr.Dataset]) -> dict[str, Array]:
     return {name: np.mean(points, axis=0) for name, points in places.items()}
 
 
-def own_masks(fitted: xr.Dataset) -> dict[str, Mask]:
+def own_masks(fitted: Dataset) -> dict[str, Mask]:
     """Masks (n,) of the regions that were stored with the capture."""
     if variables.REGION_MASK not in fitted:
         return {}
@@ -104,7 +105,7 @@ def own_masks(fitted: xr.Dataset) -> dict[str, Mask]:
     return {str(name): mask[:, i] for i, name in enumerate(fitted["region"].values)}
 
 
-def landmark_masks(registered: xr.Dataset | None) -> dict[str, Mask]:
+def landmark_masks(registered: Dataset | None) -> dict[str, Mask]:
     """Masks (n,) of the regions defined by the landmarks of a registered take; none
     without a registration.
     """
@@ -118,9 +119,7 @@ def landmark_masks(registered: xr.Dataset | None) -> dict[str, Mask]:
     return region_masks(registered[variables.COMMON_UV].values, named)
 
 
-def take_masks(
-    model: xr.DataTree, registered: xr.Dataset | None = None
-) -> dict[str, Mask]:
+def take_masks(model: DataTree, registered: Dataset | None = None) -> dict[str, Mask]:
     """Masks (n,) of the regions of a take; those of its capture replace those defined
     by the landmarks.
     """
@@ -152,8 +151,9 @@ def _region_mask(name: str, uv: Array, landmarks: Mapping[str, Array]) -> Mask |
     except KeyError:
         return None
     if middle:
-        return inside_outline(uv, np.concatenate([right, left_side[::-1]]))
-    return inside_outline(uv, right) | inside_outline(uv, left_side)
+        both = np.concatenate([right, left_side[::-1]])
+        return np.asarray(points_in_poly(uv, both))
+    return np.asarray(points_in_poly(uv, right) | points_in_poly(uv, left_side))
 
 
 def _corners(
@@ -174,21 +174,3 @@ def _corners(
             for name, sideways, below in outline
         ]
     )
-
-
-def inside_outline(points: Array, outline: Array) -> Mask:
-    """Whether points (n, 2) lie inside a closed outline (m, 2), by the even-odd rule."""
-    x, y = points.T
-    left, top = outline.min(axis=0)
-    right, bottom = outline.max(axis=0)
-    near = np.flatnonzero((x >= left) & (x <= right) & (y >= top) & (y <= bottom))
-    x, y = points[near].T
-    within = np.zeros(len(near), bool)
-    for (ax, ay), (bx, by) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
-        if ay != by:
-            within ^= ((ay > y) != (by > y)) & (
-                x < ax + (y - ay) / (by - ay) * (bx - ax)
-            )
-    inside = np.zeros(len(points), bool)
-    inside[near] = within
-    return inside

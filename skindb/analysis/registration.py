@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import xarray as xr
+from xarray import Dataset, DataTree
 
 from skindb.errors import input_error
 from skindb.geometry.atlas import signed_areas
@@ -29,8 +29,8 @@ from skindb.schema.consent import honour_consent
 from skindb.schema.notes import Note, note
 from skindb.types import Array, Float64, Index, finite_rows, float64, lengths
 
-Takes = Mapping[str, xr.DataTree]
-Registered = Mapping[str, xr.Dataset]
+Takes = Mapping[str, DataTree]
+Registered = Mapping[str, Dataset]
 MEAN = "mean"
 # a landmark is doubtful if its prediction error [mm], its ratio to the error in other
 # takes, and its ratio to the largest error of its own take are above these
@@ -46,7 +46,7 @@ HEIGHT = 1e-2  # of the plane from which rays start, in units of uv
 
 def register(
     models: Takes, *, reference: str | None = None, smoothing: float | None = None
-) -> dict[str, xr.Dataset]:
+) -> dict[str, Dataset]:
     """Common texture coordinates of takes that have landmarks; takes without landmarks are omitted.
 
     The landmarks of a face do not constrain ears, neck and scalp. There, corresponding
@@ -103,7 +103,7 @@ class Frame:
 
 def registrations(
     models: Takes, *, reference: str | None = None, smoothing: float | None = None
-) -> Iterator[tuple[str, xr.Dataset]]:
+) -> Iterator[tuple[str, Dataset]]:
     """Items of the result of `register`; only the surfaces of the template and one
     other take are in memory.
     """
@@ -119,7 +119,7 @@ def registrations(
         yield take, register_one(take, model, takes[frame.template], frame)
 
 
-def landmark_names(models: Iterable[xr.DataTree]) -> tuple[str, ...]:
+def landmark_names(models: Iterable[DataTree]) -> tuple[str, ...]:
     """Names of the landmarks of all takes."""
     return tuple(
         dict.fromkeys(
@@ -128,7 +128,7 @@ def landmark_names(models: Iterable[xr.DataTree]) -> tuple[str, ...]:
     )
 
 
-def outline(model: xr.DataTree, names: Sequence[str]) -> Outline:
+def outline(model: DataTree, names: Sequence[str]) -> Outline:
     """Outline of a take, the input of `common_frame`."""
     sheet = _sheet(model, list(names))
     return Outline(
@@ -191,8 +191,8 @@ def common_frame(
 
 
 def register_one(
-    take: str, model: xr.DataTree, template: xr.DataTree, frame: Frame
-) -> xr.Dataset:
+    take: str, model: DataTree, template: DataTree, frame: Frame
+) -> Dataset:
     """Common texture coordinates of one take; see `register`."""
     names = list(frame.names)
     landmark_uv = frame.at
@@ -243,12 +243,12 @@ def _template_take(outlines: Mapping[str, Outline], target: Array) -> str:
     return max(visible_area, key=lambda take: np.nan_to_num(visible_area[take]))
 
 
-def with_landmarks(models: Takes) -> dict[str, xr.DataTree]:
+def with_landmarks(models: Takes) -> dict[str, DataTree]:
     """The takes that have landmarks and can be registered."""
     return {take: model for take, model in models.items() if has_landmarks(model)}
 
 
-def _sheet(model: xr.DataTree, names: list[str]) -> Sheet:
+def _sheet(model: DataTree, names: list[str]) -> Sheet:
     """Surface of a take and its landmarks (k, 3); NaN for landmarks that the take lacks."""
     mesh = model["mesh"].to_dataset()
     landmark = np.full((len(names), 3), np.nan)
@@ -271,7 +271,7 @@ def _landmark_uv(sheet: Sheet) -> Float64:
     return out
 
 
-def _landmarks_mm(model: xr.DataTree) -> Float64:
+def _landmarks_mm(model: DataTree) -> Float64:
     return float64(model["mesh"].to_dataset()[variables.LANDMARK_POSITION].values)
 
 
@@ -289,7 +289,7 @@ def _mm_per_uv(landmark: Array, target: Array) -> float:
     return face / flat if flat > 0 else float("nan")
 
 
-def has_landmarks(model: xr.DataTree) -> bool:
+def has_landmarks(model: DataTree) -> bool:
     """Whether a take has at least one landmark."""
     if (
         "mesh" not in model.children
@@ -301,7 +301,7 @@ def has_landmarks(model: xr.DataTree) -> bool:
 
 def _registration_dataset(
     sheet: Sheet, source: Array, target: Array, warp: Warp
-) -> xr.Dataset:
+) -> Dataset:
     """Common coordinates of a take and the quality of its warp."""
     common = apply_warp(warp, sheet.uv).astype(np.float32)
     turned = (signed_areas(common, sheet.faces) < 0) & (
@@ -329,7 +329,7 @@ def _registration_dataset(
 
 
 def corresponding_points(
-    model: xr.DataTree, registered: xr.Dataset, common: Array
+    model: DataTree, registered: Dataset, common: Array
 ) -> Float64:
     """Surface points (n, 3) [mm] of a take at common texture coordinates (n, 2); NaN
     outside its surface.
@@ -364,32 +364,22 @@ def tabulate_registration(registered: Registered) -> tuple[list[str], list[list[
             scale * registration[f"landmark_{name}"].values
             for name in ("residual", "prediction_error")
         )
-        row = [
-            take,
-            registration.attrs["warp_kind"],
-            int(registration[variables.LANDMARK_USED].sum()),
-        ]
-        row += [float(registration.attrs["warp_smoothing"])]
-        row += (
-            [float(np.nanmax(misfit))]
-            if np.isfinite(misfit).any() and len(registered) > 1
-            else [float("nan")]
-        )
+        attrs = registration.attrs
         # a single take has no other to compare with
-        if np.isfinite(error).any() and len(registered) > 1:
-            worst = int(np.nanargmax(error))
-            row += [
-                float(np.nanmedian(error)),
-                float(error[worst]),
-                str(registration["landmark"].values[worst]),
-            ]
-        else:
-            row += [float("nan"), float("nan"), "-"]
-        anchors = int(registration.attrs.get("warp_anchors", 0))
+        is_known = np.isfinite(error).any() and len(registered) > 1
+        misfit = misfit[np.isfinite(misfit)] if len(registered) > 1 else misfit[:0]
+        worst = int(np.nanargmax(error)) if is_known else 0
         rows.append(
             [
-                *row,
-                "template" if registration.attrs.get("template") == take else anchors,
+                take,
+                attrs["warp_kind"],
+                int(registration[variables.LANDMARK_USED].sum()),
+                float(attrs["warp_smoothing"]),
+                float(misfit.max()) if misfit.size else np.nan,
+                float(np.nanmedian(error)) if is_known else np.nan,
+                float(error[worst]) if is_known else np.nan,
+                str(registration["landmark"].values[worst]) if is_known else "-",
+                "template" if attrs.get("template") == take else attrs["warp_anchors"],
             ]
         )
     return header, rows
@@ -423,14 +413,12 @@ def doubtful_landmarks(registered: Registered) -> list[Note]:
         other_errors = [e for name, e in errors.items() if name != take]
         if not other_errors or not np.isfinite(error).any():
             continue
-        usual_errors = [
-            column[np.isfinite(column)] for column in np.transpose(other_errors)
-        ]
         # a landmark that no other take has is compared with the other landmarks of its take
+        alone = np.nanmedian(error)
         usual = np.array(
             [
-                np.median(column if len(column) else error[np.isfinite(error)])
-                for column in usual_errors
+                np.nanmedian(column) if np.isfinite(column).any() else alone
+                for column in np.transpose(other_errors)
             ]
         )
         # a gross error bends the mean and appears in all takes: only the take with the
@@ -439,11 +427,8 @@ def doubtful_landmarks(registered: Registered) -> list[Note]:
         unlike = (error > DOUBTFUL_RATIO * usual) | (
             (error > IMPOSSIBLE_ERROR) & (error >= worst)
         )
-        odd = (
-            (error > DOUBTFUL_ERROR)
-            & unlike
-            & (error > DOUBTFUL_FRACTION * np.nanmax(error))
-        )
+        limit = max(DOUBTFUL_ERROR, DOUBTFUL_FRACTION * np.nanmax(error))
+        odd = unlike & (error > limit)
         names = registered[take]["landmark"].values
         doubts = [
             f"{names[i]} by {error[i]:.1f} mm (other takes {usual[i]:.1f})"
@@ -460,41 +445,28 @@ def doubtful_landmarks(registered: Registered) -> list[Note]:
 
 def describe_registration(registered: Registered, takes: Iterable[str]) -> list[Note]:
     """Notes on a registration for the report of a study that uses it."""
-    without = [take for take in takes if take not in registered]
     if not registered:
-        return [
-            note(
-                "",
-                "no take has landmarks; only the regions of the captures are available",
-            )
-        ]
+        reason = "no take has landmarks; only the regions of the captures are available"
+        return [note("", reason)]
     _, rows = tabulate_registration(registered)
-    kinds = sorted({str(row[1]) for row in rows})
-    line = (
-        f"{len(rows)} takes with up to {max(row[2] for row in rows)} landmarks "
-        f"({', '.join(kinds)})"
-    )
-    measured_rows = [row for row in rows if np.isfinite(row[7])]
-    largest = []
-    if measured_rows:
-        worst = max(measured_rows, key=lambda row: row[7])
-        middle = float(np.median([row[6] for row in measured_rows]))
+    kinds = ", ".join(sorted({str(row[1]) for row in rows}))
+    line = f"{len(rows)} takes with up to {max(row[2] for row in rows)} landmarks ({kinds})"
+    notes = doubtful_landmarks(registered)
+    measured = [row for row in rows if np.isfinite(row[6])]
+    if measured:
+        worst = max(measured, key=lambda row: row[6])
+        middle = float(np.median([row[5] for row in measured]))
         line += (
             f"; error of a landmark predicted by the others: median {middle:.1f} mm, "
-            f"largest {worst[7]:.1f} mm"
+            f"largest {worst[6]:.1f} mm"
         )
-        largest = [note(worst[0], f"the largest error is that of {worst[8]}")]
-    doubts = doubtful_landmarks(registered)
-    return [
-        note("", line),
-        *largest,
-        *doubts,
-        *(note(take, "no landmarks") for take in without),
-    ]
+        notes.insert(0, note(worst[0], f"the largest error is that of {worst[7]}"))
+    without = [note(take, "no landmarks") for take in takes if take not in registered]
+    return [note("", line), *notes, *without]
 
 
 def surface_of(
-    model: xr.DataTree,
+    model: DataTree,
 ) -> tuple[Float64, Float64, Index]:
     """Positions (n, 3) in mm, texture coordinates (n, 2) and triangles (f, 3) of a take."""
     fitted = model["fitted"].to_dataset()

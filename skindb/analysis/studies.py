@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-import xarray as xr
+from xarray import Dataset, DataTree
 
 from skindb.analysis.albedo import STUDY as ALBEDO
 from skindb.analysis.brdf import STUDY as BRDF
@@ -37,25 +37,25 @@ STUDIES: dict[str, Study] = {
 }
 
 
-def study_of(results: xr.DataTree) -> Study:
+def study_of(results: DataTree) -> Study:
     """The study to which stored results belong."""
     return next(
         study for study in STUDIES.values() if study.shown[0] in results.children
     )
 
 
-def tabulate_study(results: xr.DataTree) -> Table:
+def tabulate_study(results: DataTree) -> Table:
     """Header and rows of the table of a study."""
     return study_of(results).tabulate(*_shown(results))
 
 
-def describe_study(results: xr.DataTree) -> list[str]:
+def describe_study(results: DataTree) -> list[str]:
     """Notes on a study that accompany its table, one line each."""
     return study_of(results).describe(*_shown(results))
 
 
 @plain_text()
-def plot_study(results: xr.DataTree, path: Path) -> None:
+def plot_study(results: DataTree, path: Path) -> None:
     """Plot a study and write the figure to a file."""
     from matplotlib import pyplot
 
@@ -66,6 +66,6 @@ def plot_study(results: xr.DataTree, path: Path) -> None:
     pyplot.close(figure)
 
 
-def _shown(results: xr.DataTree) -> list[xr.Dataset]:
+def _shown(results: DataTree) -> list[Dataset]:
     names = study_of(results).shown
     return [results[name].to_dataset().load() for name in names]

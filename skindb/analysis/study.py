@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
-import xarray as xr
 from dask.base import compute
 from dask.delayed import Delayed, delayed
+from xarray import Dataset
 
 from skindb.schema.notes import Note
 from skindb.threads import c_contiguous
@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 
 
 Result = TypeVar("Result")
-Results = dict[str, xr.Dataset]  # group of the stored version -> its variables
+Results = dict[str, Dataset]  # group of the stored version -> its variables
 Table = tuple[list[str], list[list[Any]]]  # header and rows
 
 
 def each_take(
     function: Callable[..., Result],
-    cohort: xr.Dataset,
+    cohort: Dataset,
     variables: Iterable[str],
     *shared: Any,
 ) -> list[Result]:
@@ -86,7 +86,7 @@ class _InOrder:
 
 
 def _in_order(value: Any) -> Any:
-    if isinstance(value, xr.Dataset):
+    if isinstance(value, Dataset):
         return value.map(
             lambda array: array.copy(data=c_contiguous(array.values)), keep_attrs=True
         )
@@ -124,8 +124,8 @@ class Population:
         Notes on the registration, to which a study may append.
     """
 
-    cohort: xr.Dataset
-    open_cohort: Callable[..., xr.Dataset]
+    cohort: Dataset
+    open_cohort: Callable[..., Dataset]
     brdf_tables: Callable[[], Array | Delayed]
     landmarks: Mapping[str, Array] = field(default_factory=dict)
     registered: Sequence[str] = ()
@@ -189,7 +189,7 @@ class Study:
         return self.uses_registration or self.layout == "maps"
 
 
-def table_of(table: xr.Dataset, names: Sequence[str], dims: Sequence[str]) -> Table:
+def table_of(table: Dataset, names: Sequence[str], dims: Sequence[str]) -> Table:
     """Header and rows of variables with the same dims, one row per element."""
     stacked = table[list(names)].stack(row=dims, create_index=False)
     columns = [stacked[name].values.tolist() for name in names]
@@ -199,6 +199,6 @@ def table_of(table: xr.Dataset, names: Sequence[str], dims: Sequence[str]) -> Ta
     return [*dims, *names], rows
 
 
-def skipped_takes(cohort: xr.Dataset) -> list[Note]:
+def skipped_takes(cohort: Dataset) -> list[Note]:
     """Notes on the takes that a cohort lacks, which its results repeat."""
     return list(cohort.attrs.get("skipped", []))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import xarray as xr
+from xarray import Dataset
 
 from skindb.errors import Fault, InputError, input_error
 from skindb.numerics.statistics import Moments
@@ -130,10 +130,8 @@ class Subjects:
     @property
     def is_normal(self) -> Mask:
         """Mask (take,) of the takes in the condition normal."""
-        if CONDITION not in self.attributes:
-            return np.ones(len(self.take), bool)
-        conditions = self.attributes[CONDITION].values
-        return np.array([value == NORMAL for value in conditions], bool)
+        conditions = self.attribute(CONDITION).values
+        return np.array([value in (NORMAL, None) for value in conditions], bool)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -144,6 +142,11 @@ class Subjects:
     def described(self) -> list[str]:
         """Attributes of the subjects, which are the same in all conditions."""
         return [name for name in self.attributes if name != CONDITION]
+
+    def attribute(self, name: str) -> Attribute:
+        """An attribute of the takes, unknown in all of them if none states it."""
+        unknown = Attribute(name, (None,) * len(self.take))
+        return self.attributes.get(name, unknown)
 
     def select(self, rows: Iterable[int]) -> Subjects:
         """The takes with these indices."""
@@ -160,7 +163,7 @@ class Subjects:
     def by_subject(self, name: str, subjects: Sequence[str]) -> Attribute:
         """An attribute of the named subjects, each from its first take that has it."""
         value_of: dict[str, Value] = {}
-        values = self.attributes[name].values
+        values = self.attribute(name).values
         for subject, value in zip(self.subject, values, strict=True):
             if value is not None:
                 value_of.setdefault(subject, value)
@@ -171,7 +174,7 @@ class Subjects:
         return np.array([name == subject for name in self.subject], bool)
 
 
-def subjects_of(cohort: xr.Dataset) -> Subjects:
+def subjects_of(cohort: Dataset) -> Subjects:
     """Parse the attributes of the takes of a cohort."""
     attributes = {}
     for name, coordinate in cohort.coords.items():
@@ -190,9 +193,7 @@ def subjects_of(cohort: xr.Dataset) -> Subjects:
     )
 
 
-def takes_to_compare(
-    cohort: xr.Dataset, group_by: str | None
-) -> tuple[xr.Dataset, Subjects]:
+def takes_to_compare(cohort: Dataset, group_by: str | None) -> tuple[Dataset, Subjects]:
     """Takes that are used in a comparison, with their subjects: those in the condition
     normal, or all takes if conditions are compared.
 
@@ -218,7 +219,7 @@ def takes_to_compare(
 class Groups:
     """Takes that are compared, and those of each group."""
 
-    takes: xr.Dataset
+    takes: Dataset
     subject: tuple[str, ...]  # of each take
     members: dict[str, list[int]]  # sorted names of the groups -> rows of their takes
     attrs: dict[str, Any]  # of a table of the groups
@@ -229,7 +230,7 @@ class Groups:
         return Moments.stacked(Moments.of(values[rows]) for rows in members)
 
 
-def grouped(cohort: xr.Dataset, group_by: str | None) -> Groups:
+def grouped(cohort: Dataset, group_by: str | None) -> Groups:
     """The groups of a comparison; see `takes_to_compare` and `groups_by`."""
     takes, subjects = takes_to_compare(cohort, group_by)
     members: dict[str, list[int]] = {}
@@ -243,7 +244,7 @@ def grouped(cohort: xr.Dataset, group_by: str | None) -> Groups:
     return Groups(takes, subjects.subject, dict(sorted(members.items())), attrs)
 
 
-def level_error(takes: xr.Dataset) -> float:
+def level_error(takes: Dataset) -> float:
     """Largest standard error of R_d that the takes have in common by the prior of their
     surface's reflection; NaN if no take states one.
     """
@@ -340,7 +341,7 @@ def known_traits(subjects: Subjects) -> list[str]:
                 traits.add(f"{name}:{value}")
             elif value is True:
                 traits.add(name)
-    if np.isfinite(number_of_takes(subjects, AGE)).any():
+    if np.isfinite(subjects.attribute(AGE).numbers).any():
         traits.add(OLDER)
     return sorted(traits - {f"{CONDITION}:{NORMAL}"})
 
@@ -365,27 +366,20 @@ def has_trait(subjects: Subjects, trait: str) -> Mask:
     """Mask (take,) of the takes that have a trait, given by its full name."""
     name, _, value = trait.partition(":")
     if trait == OLDER:
-        ages = number_of_takes(subjects, AGE)
-        age_of: dict[str, float] = {}
-        for subject, age in zip(subjects.subject, ages.tolist(), strict=True):
-            if np.isfinite(age):  # the first take of a subject that states an age
-                age_of.setdefault(subject, age)
-        return np.asarray(ages > (np.median([*age_of.values()]) if age_of else np.inf))
-    if name not in subjects.attributes:
-        return np.zeros(len(subjects.take), bool)
-    values = subjects.attributes[name].values
+        ages = subjects.by_subject(AGE, subjects.names).numbers
+        known = ages[np.isfinite(ages)]
+        median = np.median(known) if known.size else np.inf
+        return np.asarray(subjects.attribute(AGE).numbers > median)
+    values = subjects.attribute(name).values
     return np.array([v == value if value else v is True for v in values], bool)
 
 
 def has_attribute(subjects: Subjects, trait: str) -> Mask:
     """Mask (take,) of the takes that have the attribute of a trait."""
+    attribute = subjects.attribute(trait.partition(":")[0])
     if trait == OLDER:
-        return np.isfinite(number_of_takes(subjects, AGE))
-    name = trait.partition(":")[0]
-    if name not in subjects.attributes:
-        return np.zeros(len(subjects.take), bool)
-    values = subjects.attributes[name].values
-    return np.array([value is not None for value in values], bool)
+        return np.isfinite(attribute.numbers)
+    return np.array([value is not None for value in attribute.values], bool)
 
 
 def comparable_takes(subjects: Subjects, trait: str) -> Mask:
@@ -421,19 +415,11 @@ def subjects_without_normal(subjects: Subjects) -> list[Note]:
 
 def numeric_attributes(subjects: Subjects) -> list[str]:
     """Attributes with more than two different numbers, sorted."""
-    names = []
-    for name in sorted(subjects.attributes):
-        numbers = subjects.attributes[name].numbers
-        if len(set(numbers[np.isfinite(numbers)].tolist())) > 2:
-            names.append(name)
-    return names
-
-
-def number_of_takes(subjects: Subjects, name: str) -> Array:
-    """Values (take,) of an attribute that are numbers; NaN for the others."""
-    if name not in subjects.attributes:
-        return np.full(len(subjects.take), np.nan)
-    return subjects.attributes[name].numbers
+    return [
+        name
+        for name in sorted(subjects.attributes)
+        if len({x for x in subjects.attribute(name).numbers if np.isfinite(x)}) > 2
+    ]
 
 
 def notes_on_attributes(subjects: Subjects) -> list[str]:

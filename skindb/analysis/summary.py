@@ -3,10 +3,11 @@ sample of surfels.
 """
 
 from collections.abc import Collection, Mapping
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
+from xarray import Dataset, DataTree
 
 from skindb.analysis.regions import own_masks
 from skindb.errors import InputError, input_error, require
@@ -16,7 +17,7 @@ from skindb.schema import FitStatus, TexelStatus, Use, dataset, names_of, variab
 from skindb.schema.cohort import Held, combine, take_coords
 from skindb.schema.consent import consent_scope
 from skindb.schema.declaration import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
-from skindb.schema.label import FACE
+from skindb.schema.label import CHANNELS, FACE
 from skindb.schema.notes import note
 from skindb.types import AnyArray, Array, Index, Mask, finite_rows
 
@@ -28,8 +29,8 @@ SIZE = 512  # texels along each side of the stored maps of a registration
 
 
 def sample_surfels(
-    model: xr.DataTree, *, surfels: int = SAMPLED, seed: int = 0
-) -> xr.Dataset:
+    model: DataTree, *, surfels: int = SAMPLED, seed: int = 0
+) -> Dataset:
     """A random sample of the fitted surfels of a model.
 
     Parameters
@@ -74,7 +75,7 @@ def sample_surfels(
     )
 
 
-def summary_tables(model: xr.DataTree) -> xr.Dataset:
+def summary_tables(model: DataTree) -> Dataset:
     """Tables of one model for population studies: regions, basis and probe sites.
 
     Returns
@@ -104,7 +105,7 @@ def summary_tables(model: xr.DataTree) -> xr.Dataset:
     )
 
 
-def region_tables(fitted: xr.Dataset, masks: Mapping[str, Mask]) -> xr.Dataset:
+def region_tables(fitted: Dataset, masks: Mapping[str, Mask]) -> Dataset:
     """Area-weighted means over the trusted surfels of regions.
 
     Parameters
@@ -126,52 +127,44 @@ def region_tables(fitted: xr.Dataset, masks: Mapping[str, Mask]) -> xr.Dataset:
     trusted = trusted_surfels(fitted)
     area = fitted[variables.SURFEL_AREA].values.astype(float)
     colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(float)
-    noise, total = (
-        _values(fitted, f"diffuse_reflectance_{name}", (3,))
-        for name in ("error", "total_error")
+    noise, total, shine, shine_error = (
+        fitted[name].values.astype(float)
+        if name in fitted
+        else np.full((len(area), *shape), np.nan)
+        for name, shape in (
+            (variables.DIFFUSE_REFLECTANCE_ERROR, (3,)),
+            (variables.DIFFUSE_REFLECTANCE_TOTAL_ERROR, (3,)),
+            (variables.SURFACE_REFLECTANCE, ()),
+            (variables.SURFACE_REFLECTANCE_ERROR, ()),
+        )
     )
-    shine, shine_error = (
-        _values(fitted, name, ())
-        for name in (variables.SURFACE_REFLECTANCE, variables.SURFACE_REFLECTANCE_ERROR)
-    )
-    rows = []
+    # model errors of neighbouring surfels are correlated: averaging does not reduce them
+    model_error = np.sqrt(np.maximum(total**2 - noise**2, 0))
+    tables: dict[str, list[Any]] = {}
     for mask in masks.values():
         inside = mask & trusted
         weight = area[inside]
         mean, error = _weighted_mean(colour[inside], noise[inside], weight)
-        # model errors of neighbouring surfels are correlated: averaging does not reduce them
-        model_error = np.sqrt(np.maximum(total[inside] ** 2 - noise[inside] ** 2, 0))
-        common = _weighted_mean(model_error, model_error, weight)[0]
-        gloss = shine[inside]
-        gloss_mean, _ = _weighted_mean(gloss, gloss, weight)
-        _, gloss_error = _weighted_mean(gloss, shine_error[inside], weight)
-        rows.append(
-            {
-                variables.REGION_SURFELS: int(inside.sum()),
-                variables.REGION_AREA: float(weight.sum()),
-                variables.REGION_DIFFUSE_REFLECTANCE: mean,
-                variables.REGION_DIFFUSE_REFLECTANCE_ERROR: error,
-                variables.REGION_DIFFUSE_REFLECTANCE_TOTAL_ERROR: np.hypot(
-                    error, common
-                ),
-                variables.REGION_DIFFUSE_COVARIANCE: _covariance(
-                    colour[inside], weight
-                ),
-                variables.REGION_SURFACE_REFLECTANCE: gloss_mean,
-                variables.REGION_SURFACE_REFLECTANCE_ERROR: gloss_error,
-            }
-        )
-    tables = {
-        name: np.stack([np.asarray(row[name]) for row in rows]) for name in rows[0]
-    }
-    channels = ["R", "G", "B"]
+        common, _ = _weighted_mean(model_error[inside], model_error[inside], weight)
+        gloss, gloss_error = _weighted_mean(shine[inside], shine_error[inside], weight)
+        for name, value in (
+            (variables.REGION_SURFELS, inside.sum()),
+            (variables.REGION_AREA, weight.sum()),
+            (variables.REGION_DIFFUSE_REFLECTANCE, mean),
+            (variables.REGION_DIFFUSE_REFLECTANCE_ERROR, error),
+            (variables.REGION_DIFFUSE_REFLECTANCE_TOTAL_ERROR, np.hypot(error, common)),
+            (variables.REGION_DIFFUSE_COVARIANCE, _covariance(colour[inside], weight)),
+            (variables.REGION_SURFACE_REFLECTANCE, gloss),
+            (variables.REGION_SURFACE_REFLECTANCE_ERROR, gloss_error),
+        ):
+            tables.setdefault(name, []).append(value)
     return dataset(
-        tables,
-        coords={"region": list(masks), "channel": channels, "channel_2": channels},
+        {name: np.stack(values) for name, values in tables.items()},
+        coords={"region": list(masks), "channel": CHANNELS, "channel_2": CHANNELS},
     )
 
 
-def trusted_surfels(fitted: xr.Dataset) -> Mask:
+def trusted_surfels(fitted: Dataset) -> Mask:
     """Mask (surfel,) of surfels that are fitted, by Lambert's law at least,
     well-conditioned and have enough samples; see `TexelStatus`. In takes without a surfel
     that has enough, as under few lights, the number of samples does not matter.
@@ -186,7 +179,7 @@ def trusted_surfels(fitted: xr.Dataset) -> Mask:
     return np.asarray(good & finite_rows(fitted[variables.DIFFUSE_REFLECTANCE].values))
 
 
-def no_surfels_error(model: xr.DataTree) -> InputError:
+def no_surfels_error(model: DataTree) -> InputError:
     """Error for a take without fitted surfels, which a population cannot use."""
     take = str(model.attrs.get("take", model.attrs.get("subject", "take")))
     return input_error(
@@ -197,7 +190,7 @@ def no_surfels_error(model: xr.DataTree) -> InputError:
     )
 
 
-def _basis_tables(model: xr.DataTree, fitted: xr.Dataset) -> xr.Dataset:
+def _basis_tables(model: DataTree, fitted: Dataset) -> Dataset:
     """Coefficients of the reduced basis, its mixtures, and the mean weights of the dictionary."""
     basis = model["basis"].to_dataset()
     names = (
@@ -206,39 +199,26 @@ def _basis_tables(model: xr.DataTree, fitted: xr.Dataset) -> xr.Dataset:
         variables.DISC_ANGULAR_RADIUS,
     )
     tables = basis[[name for name in names if name in basis]].load()
-    eta = (
-        fitted[[variables.REFRACTIVE_INDEX]]
-        if variables.REFRACTIVE_INDEX in fitted
-        else xr.Dataset()
-    )
-    eta = eta.reset_coords(drop=True)
+    index = [name for name in (variables.REFRACTIVE_INDEX,) if name in fitted]
+    eta = fitted[index].reset_coords(drop=True)
     if variables.BASIS_WEIGHT not in fitted:
         return xr.merge([tables, eta])
-    good = finite_rows(fitted[variables.BASIS_WEIGHT].values) & (
+    weights = fitted[variables.BASIS_WEIGHT].values.astype(float)
+    good = finite_rows(weights) & (
         fitted[variables.FIT_STATUS].values == FitStatus.FITTED
     )
-    area = fitted[variables.SURFEL_AREA].values[good].astype(float)
-    weights = fitted[variables.BASIS_WEIGHT].values[good].astype(float)
-    mean = (
-        np.average(weights, axis=0, weights=area)
-        if good.any()
-        else np.full(weights.shape[1:], np.nan)
-    )
-    coords = (
-        {"component": fitted["component"].values}
-        if "component" in fitted.coords
-        else {}
-    )
+    mean = np.full(weights.shape[1:], np.nan)
+    if good.any():
+        area = fitted[variables.SURFEL_AREA].values[good].astype(float)
+        mean = np.average(weights[good], axis=0, weights=area)
+    coords = {"component": fitted["component"]} if "component" in fitted.coords else {}
     # a cohort needs the labels of the dictionary even if the model stores no mixtures
     weights_table = dataset({variables.MEAN_BASIS_WEIGHT: mean}, coords=coords)
-    return xr.merge(
-        [tables, weights_table, eta],
-        combine_attrs="override",
-        join="outer",
-    )
+    parts = [tables, weights_table, eta]
+    return xr.merge(parts, combine_attrs="override", join="outer")
 
 
-def _median_errors(fitted: xr.Dataset) -> xr.Dataset:
+def _median_errors(fitted: Dataset) -> Dataset:
     """Medians over the surfels of the residuals and of the errors at held-out samples."""
     medians = {}
     for name in names_of(Use.MEDIAN):
@@ -248,16 +228,6 @@ def _median_errors(fitted: xr.Dataset) -> xr.Dataset:
     return dataset(
         {variables.MEDIAN_ERROR: list(medians.values())},
         coords={"measure": list(medians)},
-    )
-
-
-def _values(fitted: xr.Dataset, name: str, shape: tuple[int, ...]) -> Array:
-    """Values (surfel, *shape) of a variable; NaN if the model does not have it."""
-    shape_of_all = (fitted.sizes["surfel"], *shape)
-    return np.asarray(
-        fitted[name].values.astype(float)
-        if name in fitted
-        else np.full(shape_of_all, np.nan)
     )
 
 
@@ -286,13 +256,13 @@ def _covariance(colour: Array, weight: Array) -> AnyArray:
 
 
 def cohort_of(
-    models: Mapping[str, xr.DataTree],
+    models: Mapping[str, DataTree],
     layout: Literal["tables", "surfels"] = "tables",
     *,
-    captures: Mapping[str, xr.DataTree] | None = None,
+    captures: Mapping[str, DataTree] | None = None,
     surfels: int = 2000,
     seed: int = 0,
-) -> xr.Dataset:
+) -> Dataset:
     """Combine models in memory into a cohort with the layout of `Database.cohort`,
     without the table of predictions.
 
@@ -355,31 +325,24 @@ def cohort_of(
     )
 
 
-def _samples_of(capture: xr.DataTree, index: Index) -> xr.Dataset:
+def _samples_of(capture: DataTree, index: Index) -> Dataset:
     """Reflectance samples of the selected surfels, and the positions of the lights and
     cameras of the dome.
     """
-    dome = (
-        capture["dome"]
-        .to_dataset()[[variables.LIGHT_POSITION, variables.CAMERA_POSITION]]
-        .load()
-    )
-    samples = (
-        capture["samples"]
-        .to_dataset()[[variables.REFLECTANCE_SAMPLE]]
-        .isel(surfel=index)
-        .load()
-    )
-    return xr.merge([samples, dome], combine_attrs="override")
+    places = [variables.LIGHT_POSITION, variables.CAMERA_POSITION]
+    dome = capture["dome"].to_dataset()[places]
+    samples = capture["samples"].to_dataset()[[variables.REFLECTANCE_SAMPLE]]
+    chosen = samples.isel(surfel=index)
+    return xr.merge([chosen.load(), dome.load()], combine_attrs="override")
 
 
 def common_maps(
-    model: xr.DataTree,
-    registered: xr.Dataset,
+    model: DataTree,
+    registered: Dataset,
     *,
     size: int = SIZE,
     maps: Collection[str] | None = None,
-) -> xr.Dataset:
+) -> Dataset:
     """Albedo, surface reflectance and translucency of one take as maps in the common (u, v).
 
     Parameters
@@ -409,23 +372,22 @@ def common_maps(
     raster = rasterise_atlas(uv, triangles, size)
     status = texel_codes(codes, triangles, *raster)
     outside = status == TexelStatus.OUTSIDE
-    coverage = np.zeros((size, size), np.float32)
-    found = {variables.TEXEL_STATUS: status, variables.TEXEL_COVERAGE: coverage}
+    found: dict[str, AnyArray] = {variables.TEXEL_STATUS: status}
     for name in names_of(Use.MAPPED):
         needed = maps is None or f"texel_{name}" in maps
         if name not in fitted or not (needed or name == variables.DIFFUSE_REFLECTANCE):
             continue
         values = fitted[name].values.reshape(len(codes), -1).astype(np.float32)
-        trust = ((codes == TexelStatus.MEASURED) & finite_rows(values)).astype(
-            np.float32
-        )
+        is_trusted = (codes == TexelStatus.MEASURED) & finite_rows(values)
+        trust = is_trusted.astype(np.float32)
         image, weight = atlas_values(np.nan_to_num(values), trust, triangles, raster)
         if name == variables.DIFFUSE_REFLECTANCE:
-            coverage[:] = np.where(outside, np.float32(0), weight)
+            weight_inside = np.where(outside, np.float32(0), weight)
+            found[variables.TEXEL_COVERAGE] = weight_inside
         filled = (
             push_pull(image, weight)[0] if trust.any() else np.full_like(image, np.nan)
         )
         filled[outside] = np.nan
         found[f"texel_{name}"] = filled if fitted[name].ndim == 2 else filled[..., 0]
     chosen = {name: found[name] for name in found if maps is None or name in maps}
-    return dataset(chosen, coords={"channel": ["R", "G", "B"]})
+    return dataset(chosen, coords={"channel": CHANNELS})

@@ -4,15 +4,16 @@ of the takes.
 Weyrich et al. 2005, section 10.1 and figures 7, 14 and 15.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from dask.delayed import Delayed
+from numpy.random import Generator
+from xarray import Dataset
 
 from skindb.analysis.brdf import population_basis
 from skindb.analysis.brdf_plots import plot_space
@@ -55,7 +56,7 @@ from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, store
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
 from skindb.threads import c_contiguous
-from skindb.types import AnyArray, Array, Mask
+from skindb.types import AnyArray, Array, Mask, finite_rows
 
 # subjects of a group, below which p values are approximate if the groups have different
 # variances
@@ -94,14 +95,14 @@ class _Subjects:
 
 
 def brdf_space(
-    cohort: xr.Dataset,
+    cohort: Dataset,
     *,
-    basis: xr.Dataset,
+    basis: Dataset,
     tables: Array | Delayed,
     group_by: str,
     permutations: int = 10_000,
-    rng: np.random.Generator,
-) -> xr.Dataset:
+    rng: Generator,
+) -> Dataset:
     """Mean surface BRDFs of groups, distances between groups and between takes, and a
     map of the takes.
 
@@ -165,7 +166,7 @@ def brdf_space(
     mapped, explained, error = classical_scaling(distance)
     pairs = [
         _compared_pair(subjects, pair, permutations, rng)
-        for pair in combinations(range(len(subjects.groups)), 2)
+        for pair in itertools.combinations(range(len(subjects.groups)), 2)
     ]
     adjusted, method = _adjusted(subjects, pairs, permutations, rng)
     means = known_mean(subjects.coefficient)
@@ -213,7 +214,7 @@ def _require_different(distance: Array, group_by: str) -> None:
 
 
 def grouped_takes(
-    cohort: xr.Dataset, group_by: str
+    cohort: Dataset, group_by: str
 ) -> tuple[Subjects, list[str], list[str]]:
     """Takes that belong to a group, the names of their groups, and a flag about excluded takes.
 
@@ -263,7 +264,7 @@ def grouped_takes(
     return subjects, [named[i] for i in rows], flags
 
 
-def _coefficients(names: Sequence[str], basis: xr.Dataset) -> Array:
+def _coefficients(names: Sequence[str], basis: Dataset) -> Array:
     """Coefficients (take, component) of the takes; raises `InputError` for missing ones
     and for a dependent basis.
     """
@@ -280,20 +281,15 @@ def _coefficients(names: Sequence[str], basis: xr.Dataset) -> Array:
             f"{len(mixture)} components of rank {rank}",
             "choose a smaller k",
         )
-    row_of = {str(take): i for i, take in enumerate(basis["take"].values)}
-    stored = basis[variables.TAKE_COEFFICIENT].values.astype(float)
-    bad = [
-        name
-        for name in names
-        if name not in row_of or not np.isfinite(stored[row_of[name]]).all()
-    ]
-    if bad:
+    stored = basis[variables.TAKE_COEFFICIENT].reindex(take=list(names)).values
+    if not (is_known := finite_rows(stored)).all():
         rule = "a take must have fitted surfels"
         cure = "fit it again, or exclude it"
         raise InputError(
-            Fault(f"take {name}", rule, "none in the basis", cure) for name in bad
+            Fault(f"take {name}", rule, "none in the basis", cure)
+            for name in itertools.compress(names, ~is_known)
         )
-    return stored[[row_of[name] for name in names]]
+    return stored.astype(float)
 
 
 def _metric_and_basis(mixture: Array) -> Any:
@@ -356,7 +352,7 @@ class _Pair:
 
 
 def _compared_pair(
-    subjects: _Subjects, pair: tuple[int, int], max_draws: int, rng: np.random.Generator
+    subjects: _Subjects, pair: tuple[int, int], max_draws: int, rng: Generator
 ) -> _Pair:
     """Compare two groups: within the subjects measured in both, if there are any."""
     values = subjects.place[:, pair]
@@ -402,7 +398,7 @@ def _adjusted(
     subjects: _Subjects,
     pairs: Sequence[_Pair],
     max_draws: int,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> tuple[Array, str]:
     """P values adjusted for all pairs, and the method: joint permutations of all groups
     if these are valid.
@@ -423,7 +419,7 @@ def _adjusted(
     return np.maximum(largest, p), "largest statistic"
 
 
-def tabulate_brdf_space(space: xr.Dataset) -> Table:
+def tabulate_brdf_space(space: Dataset) -> Table:
     """Header and rows of the table of `brdf_space`, one row per pair of groups."""
     counts = {
         f"subjects_{side}": space[variables.PAIR_SUBJECT_COUNT].sel(
@@ -434,7 +430,7 @@ def tabulate_brdf_space(space: xr.Dataset) -> Table:
     return table_of(space.assign(counts), [*counts, *COLUMNS], ["pair"])
 
 
-def describe_brdf_space(space: xr.Dataset) -> list[str]:
+def describe_brdf_space(space: Dataset) -> list[str]:
     """Results of a study of the space of BRDFs and its flags, one line each."""
     p = space[variables.GROUP_DISTANCE_P_ADJUSTED].values
     compared = int(np.isfinite(p).sum())

@@ -7,8 +7,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-import xarray as xr
+from numpy.random import Generator
 from scipy.ndimage import gaussian_filter
+from xarray import Dataset
 
 from skindb.analysis.regions import map_regions
 from skindb.analysis.study import each_take, skipped_takes
@@ -55,9 +56,7 @@ def texel_regions(landmarks: Mapping[str, Array], size: int = SIZE) -> dict[str,
     return {name: masks[name] for name in REGIONS if name in masks}
 
 
-def texture_statistics(
-    cohort: xr.Dataset, *, landmarks: Mapping[str, Array]
-) -> xr.Dataset:
+def texture_statistics(cohort: Dataset, *, landmarks: Mapping[str, Array]) -> Dataset:
     """Quantile functions of log albedo and of its bands, for every take and region.
 
     The logarithm is used because pigments attenuate by a factor: a change of pigment
@@ -130,7 +129,7 @@ def texture_statistics(
     )
 
 
-def log_albedo(maps: xr.Dataset) -> tuple[Array, Mask]:
+def log_albedo(maps: Dataset) -> tuple[Array, Mask]:
     """Log R_d (v, u, 3) of a map, extrapolated to texels without measurements, and the
     mask (v, u) of measured ones.
     """
@@ -140,7 +139,7 @@ def log_albedo(maps: xr.Dataset) -> tuple[Array, Mask]:
     return push_pull(log, measured.astype(np.float32))[0], measured
 
 
-def _measured_log(maps: xr.Dataset) -> tuple[Array, Mask]:
+def _measured_log(maps: Dataset) -> tuple[Array, Mask]:
     """Log R_d (v, u, 3), NaN where it is unknown, and the mask (v, u) of measured texels."""
     albedo = maps[variables.TEXEL_DIFFUSE_REFLECTANCE].values
     measured = maps[variables.TEXEL_COVERAGE].values > COVERED
@@ -156,7 +155,7 @@ def decorrelated(log: Array, mean: Array, axes: Array) -> Array:
     return images.reshape(-1, *log.shape[:-1]).astype(np.float32, copy=False)
 
 
-def _moments(maps: xr.Dataset) -> tuple[Array, Array] | None:
+def _moments(maps: Dataset) -> tuple[Array, Array] | None:
     """Mean (3,) and covariance (3, 3) of the log albedo of a take; None if it is unknown."""
     log, measured = _measured_log(maps)
     if not measured.any():
@@ -184,17 +183,21 @@ def colour_axes(
     return mean, axes * np.where(axes.sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
 
 
+def covered_fractions(measured: Mask, regions: Mask) -> Array:
+    """Fraction (region,) of the texels of each region (region, v, u) that are measured."""
+    texels = np.maximum(regions.sum(axis=(1, 2)), 1)
+    return np.asarray((measured & regions).sum(axis=(1, 2)) / texels)
+
+
 def _distributions(
-    maps: xr.Dataset, drawn: Mask, mean: Array, axes: Array
+    maps: Dataset, drawn: Mask, mean: Array, axes: Array
 ) -> tuple[Array, Array]:
     """Quantiles (region, axis, part, level) of a take, NaN for regions of which it has
     measured less than half, and the measured fractions (region,); the face, which is
     the first region, needs no minimum coverage.
     """
     log, measured = log_albedo(maps)
-    covered = np.array(
-        [(measured & region).sum() / max(region.sum(), 1) for region in drawn]
-    )
+    covered = covered_fractions(measured, drawn)
     enough = covered >= LEAST_COVERED
     enough[0] = True
     masks = drawn & measured & enough[:, None, None]
@@ -214,12 +217,12 @@ class TextureEdit:
 
 
 def edit_texture(
-    maps: xr.Dataset,
+    maps: Dataset,
     shift: Array,
-    texture: xr.Dataset,
+    texture: Dataset,
     *,
     iterations: int = ITERATIONS,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> TextureEdit:
     """Shift the distributions of a take's albedo in the common (u, v).
 
@@ -259,7 +262,7 @@ def edit_texture(
     counted = [drawn[i] * measured for i in matched]
     images = decorrelated(log, mean, axes)
 
-    def synthesised(axis: int, result: np.random.Generator) -> Synthesis:
+    def synthesised(axis: int, result: Generator) -> Synthesis:
         target = shift[matched, axis].astype(float)
         return synthesise(
             images[axis],
@@ -303,7 +306,7 @@ def _quantiles(images: Iterable[Array], masks: Iterable[Array]) -> Array:
 
 
 def _distances(
-    texture: xr.Dataset, matched: list[int], quantiles: list[Array]
+    texture: Dataset, matched: list[int], quantiles: list[Array]
 ) -> tuple[float | None, float | None]:
     """Distances of the edited and the unedited take from the mean of the takes.
 

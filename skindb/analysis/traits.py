@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
+from numpy.random import Generator
+from xarray import Dataset
 
 from skindb import plots
 from skindb.analysis.albedo import albedo_and_texture, quantiles
@@ -28,7 +29,6 @@ from skindb.analysis.study import (
 from skindb.analysis.subjects import (
     Subjects,
     known_traits,
-    number_of_takes,
     numeric_attributes,
     require_adjustable,
     sides,
@@ -77,15 +77,15 @@ class Units:
 
 
 def trait_vectors(
-    cohort: xr.Dataset,
+    cohort: Dataset,
     *,
-    basis: xr.Dataset,
-    albedo: xr.Dataset,
-    texture: xr.Dataset | None = None,
+    basis: Dataset,
+    albedo: Dataset,
+    texture: Dataset | None = None,
     traits: Sequence[str] | None = None,
     adjust: Sequence[str] = (),
-    rng: np.random.Generator | None = None,
-) -> xr.Dataset:
+    rng: Generator | None = None,
+) -> Dataset:
     """Shifts of surface BRDF, albedo histograms and translucency that are associated with traits.
 
     Parameters
@@ -212,34 +212,32 @@ def _determined_units(
 
 
 def _compared_values(
-    cohort: xr.Dataset,
-    basis: xr.Dataset,
-    albedo: xr.Dataset,
+    cohort: Dataset,
+    basis: Dataset,
+    albedo: Dataset,
     log_tr: Array,
-    texture: xr.Dataset | None,
+    texture: Dataset | None,
 ) -> dict[str, Array]:
     """Variable of the vectors -> values (take, ...) of which it is the difference."""
     takes = cohort["take"].values
     histograms = albedo[variables.ALBEDO_HISTOGRAM].sel(take=takes).values
+    edges = albedo[variables.HISTOGRAM_EDGE].values
     values = {
         variables.TRAIT_BRDF_SHIFT: basis[variables.TAKE_COEFFICIENT]
         .sel(take=takes)
         .values,
-        variables.TRAIT_QUANTILE_SHIFT: quantiles(
-            histograms, albedo[variables.HISTOGRAM_EDGE].values
-        ),
+        variables.TRAIT_QUANTILE_SHIFT: quantiles(histograms, edges),
         LOG_SIGMA_TR: log_tr,
     }
     if texture is not None:
-        regions = albedo["region"].values
-        values[variables.TRAIT_TEXTURE_SHIFT] = _texture_quantiles(
-            texture, takes, regions
-        )
+        everything = {"take": takes, "region": albedo["region"].values}
+        quantile = texture[variables.TEXTURE_QUANTILE].reindex(everything)
+        values[variables.TRAIT_TEXTURE_SHIFT] = quantile.values
     return values
 
 
 def _shifts(
-    units: Sequence[Units], values: Mapping[str, Array], rng: np.random.Generator
+    units: Sequence[Units], values: Mapping[str, Array], rng: Generator
 ) -> dict[str, Array]:
     """Vectors (trait, ...) of all values (take, ...), with their errors by bootstrap."""
     shifts: dict[str, list[Array]] = {name: [] for name in values}
@@ -277,7 +275,7 @@ def _sides(subjects: Subjects, trait: str, numbers: Sequence[str]) -> tuple[Mask
     """
     if trait not in numbers:
         return sides(subjects, trait)
-    is_known = np.isfinite(number_of_takes(subjects, trait)) & subjects.is_normal
+    is_known = np.isfinite(subjects.attribute(trait).numbers) & subjects.is_normal
     return is_known, np.zeros(len(is_known), bool)
 
 
@@ -307,7 +305,7 @@ def _units(
     rows = tuple((carries if s in pairs else lacks) & (who == s) for s in names)
     regressor = [1.0] * len(pairs) + [0.0] * len(others)
     if trait in numbers:
-        values = number_of_takes(subjects, trait)
+        values = subjects.attribute(trait).numbers
         regressor = [float(values[of_subject][0]) for of_subject in rows]
     held = [subjects.by_subject(name, names).columns for name in adjust]
     design = np.column_stack([regressor, np.ones(len(names)), *held])
@@ -386,25 +384,11 @@ def _flags(names: Sequence[str], counts: Array, numbers: Sequence[str]) -> list[
     return flags
 
 
-def _texture_quantiles(texture: xr.Dataset, takes: Array, regions: Array) -> Array:
-    """Quantiles (take, region, axis, part, level) of takes and regions; NaN where
-    `texture` has none.
-    """
-    values = texture[variables.TEXTURE_QUANTILE].values
-    rows, columns = (texture[dim].values.tolist() for dim in ("take", "region"))
-    out = np.full((len(takes), len(regions), *values.shape[2:]), np.nan, np.float32)
-    for t, take in enumerate(map(str, takes)):
-        for r, region in enumerate(map(str, regions)):
-            if take in rows and region in columns:
-                out[t, r] = values[rows.index(take), columns.index(region)]
-    return out
-
-
 def _mean_over_sites(log_tr: Array) -> Array:
     return known_mean(np.moveaxis(log_tr, 1, 0))
 
 
-def _log_sigma_tr(cohort: xr.Dataset) -> Array:
+def _log_sigma_tr(cohort: Dataset) -> Array:
     """Log sigma_tr (take, site, channel) of all sites; NaN where a take has no trusted value."""
     if variables.SITE_SIGMA_TR not in cohort:
         return np.full((cohort.sizes["take"], 1, 3), np.nan)
@@ -412,7 +396,7 @@ def _log_sigma_tr(cohort: xr.Dataset) -> Array:
     return np.log(float64(trusted(sites, variables.SITE_SIGMA_TR).values))
 
 
-def describe_traits(traits: xr.Dataset) -> list[str]:
+def describe_traits(traits: Dataset) -> list[str]:
     """Flags of trait vectors, and a line for each whose colours are noise.
 
     The squared length of a measured vector is the sum of the squared length of the true
@@ -442,7 +426,7 @@ def describe_traits(traits: xr.Dataset) -> list[str]:
     return lines
 
 
-def plot_traits(traits: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+def plot_traits(traits: Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot the shift of the coefficients of the surface BRDF: rows are traits, columns
     are components of the basis.
     """
@@ -464,7 +448,7 @@ def plot_traits(traits: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def tabulate_traits(traits: xr.Dataset) -> Table:
+def tabulate_traits(traits: Dataset) -> Table:
     """Header and one row per trait: numbers of takes, and RMS lengths of the parts of
     its vector and of their errors.
     """

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
+from xarray import Dataset
 
 from skindb import plots
 from skindb.analysis.contrasts import FEW
@@ -39,9 +39,7 @@ COLUMNS = (
 )
 
 
-def translucency_table(
-    cohort: xr.Dataset, *, group_by: str | None = None
-) -> xr.Dataset:
+def translucency_table(cohort: Dataset, *, group_by: str | None = None) -> Dataset:
     """Count, mean, standard deviation and variance of sigma_tr per site and channel,
     with 95 % intervals.
 
@@ -111,7 +109,7 @@ def translucency_table(
     )
 
 
-def describe_translucency(table: xr.Dataset) -> list[str]:
+def describe_translucency(table: Dataset) -> list[str]:
     """Statuses of the profiles, and groups whose intervals depend on an assumption, one
     line each.
     """
@@ -135,7 +133,7 @@ def describe_translucency(table: xr.Dataset) -> list[str]:
     return lines
 
 
-def _statuses(takes: xr.Dataset) -> dict[str, int]:
+def _statuses(takes: Dataset) -> dict[str, int]:
     """Number of profiles of each status."""
     if variables.SITE_STATUS not in takes:
         return {}
@@ -171,7 +169,7 @@ def _rms(groups: Groups, errors: Array) -> Array:
     return np.stack([np.sqrt(known_mean(errors[rows] ** 2)) for rows in members])
 
 
-def plot_translucency(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+def plot_translucency(table: Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot mean sigma_tr with its 95 % interval per site; colours are channels, markers
     are groups.
     """
@@ -199,7 +197,7 @@ def plot_translucency(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def tabulate_translucency(table: xr.Dataset) -> Table:
+def tabulate_translucency(table: Dataset) -> Table:
     """Header and one row per group, site and channel."""
     names = [name for name in COLUMNS if name in table]
     return table_of(table, names, ("group", "site", "channel"))

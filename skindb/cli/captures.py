@@ -163,7 +163,7 @@ def _simulated(simulated: tuple[int, Path]) -> tuple[str, Any, list[str]]:
 def ingest(
     db: str,
     captures: tuple[Path, ...],
-    crop_box: tuple[float, float, float, float, float, float] | None,
+    crop_box: Any,
     crop_reach: float | None,
     again: bool,
     explain: bool,

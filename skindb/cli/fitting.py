@@ -91,14 +91,15 @@ def fit(
     for take in [] if takes else workflow.takes_without_consent(database):
         echo(f"skipped: {take}: its consent does not cover fits", err=True)
     _report_kept(database, chosen, changes)
-    how = partial(
+    call = partial(
         workflow.fit_with,
+        database,
         changes=changes,
         dictionary=dictionary,
         explain=explain,
         wait=wait,
+        progress=progress,
     )
-    call = partial(how, database, progress=progress)
     finish = partial(_finished, database)
     results: dict[str, Any] = {}
     faults: list[Fault] = []

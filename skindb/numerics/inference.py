@@ -17,9 +17,10 @@ from math import factorial, prod
 from typing import Any
 
 import numpy as np
+from numpy.random import Generator
 from scipy import stats
 
-from skindb.numerics.statistics import CONFIDENCE, ROUNDING
+from skindb.numerics.statistics import CONFIDENCE, ROUNDING, Moments
 from skindb.types import AnyArray, Array, Index, Mask, finite_rows, float64
 
 Draw = AnyArray  # an order, signs or labels of the subjects, or many of them
@@ -167,16 +168,12 @@ def paired_effects(differences: Array) -> Effects:
     The error is the standard error of the mean, and `spread` the standard deviation of
     the differences.
     """
-    differences = float64(differences)
-    finite = np.isfinite(differences)
-    count = finite.sum(axis=0)
-    total = np.where(finite, differences, 0.0).sum(axis=0)
-    mean = np.where(count >= 2, total / np.maximum(count, 1), np.nan)
-    square = (np.where(finite, differences - mean, 0.0) ** 2).sum(axis=0)
-    spread = np.sqrt(square / np.maximum(count - 1, 1))
-    spread[count < 2] = np.nan
-    error = spread / np.sqrt(np.maximum(count, 1))
-    freedom = np.where(count >= 2, count - 1.0, np.nan)
+    moments = Moments.of(differences)
+    is_known = moments.count >= 2
+    mean = np.where(is_known, moments.mean, np.nan)
+    spread = moments.standard_deviation
+    error = spread / np.sqrt(np.maximum(moments.count, 1))
+    freedom = np.where(is_known, moments.count - 1.0, np.nan)
     return _effects(mean, error, spread, freedom)
 
 
@@ -196,7 +193,7 @@ def permutation_p(
     covariates: Array | None = None,
     *,
     max_draws: int = 10_000,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> tuple[Array, Array, int]:
     """P values of `effects` by permutation of the residuals after regression on the covariates.
 
@@ -238,7 +235,7 @@ def permutation_p(
 
 
 def sign_flip_p(
-    differences: Array, *, max_draws: int = 10_000, rng: np.random.Generator
+    differences: Array, *, max_draws: int = 10_000, rng: Generator
 ) -> tuple[Array, Array, int]:
     """P values of means of paired differences (n, q), by changing the signs of
     subjects; see `permutation_p`.
@@ -358,7 +355,7 @@ def _draws(
     enumeration: Callable[[], Iterable[Any]],
     draw: Callable[[], Draw],
     max_draws: int,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> tuple[Callable[[], Iterator[Draw]], int]:
     """Function that returns the same draws whenever it is called, and their number: all
     of `total` but the first, which is the identity, or random ones if there are more
@@ -414,7 +411,7 @@ def _max_t_p(
 
 
 def between_groups_p(
-    values: Array, group: Index, *, max_draws: int, rng: np.random.Generator
+    values: Array, group: Index, *, max_draws: int, rng: Generator
 ) -> tuple[Array, Array, int]:
     """Statistics and p values of all pairs of groups of different subjects, by
     permutation of the subjects.
@@ -458,7 +455,7 @@ def between_groups_p(
 
 
 def within_subjects_p(
-    values: Array, *, max_draws: int, rng: np.random.Generator
+    values: Array, *, max_draws: int, rng: Generator
 ) -> tuple[Array, Array, int]:
     """Statistics and p values of all pairs of conditions of the same subjects, by
     permutation within subjects.
@@ -513,7 +510,7 @@ def classical_scaling(distance: Array) -> tuple[Array, Array, float]:
     Parameters
     ----------
     distance
-        (n, n) symmetric.
+        (n, n) symmetric, of two points or more.
 
     Returns
     -------
@@ -533,11 +530,9 @@ def classical_scaling(distance: Array) -> tuple[Array, Array, float]:
     place = vectors[:, ::-1][:, :2] * scale
     largest = place[np.abs(place).argmax(axis=0), np.arange(place.shape[1])]
     place = place * np.where(largest < 0, -1.0, 1.0)
-    place = np.pad(place, ((0, 0), (0, 2 - place.shape[1])))
-    explained = np.pad(variance, (0, 2 - len(variance))) / total
     mapped = np.linalg.norm(place[:, None] - place[None], axis=-1)
     square = ((mapped - distance) ** 2).sum() / ((distance**2).sum() or 1.0)
-    return place, explained, float(np.sqrt(square))
+    return place, variance / total, float(np.sqrt(square))
 
 
 def _between(values: Array, group: Index, sizes: Index) -> Array:

@@ -17,7 +17,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
 from math import factorial, pi, sqrt
 from typing import Any
 
@@ -42,33 +41,10 @@ MAX_SORTED = 1 << 17
 NOISE = 0.05
 
 
-@dataclass(frozen=True)
-class Pyramid:
-    """High-pass residual, oriented bands of every level, and low-pass residual, from
-    which the image can be rebuilt.
-    """
-
-    high: Image  # (h, w)
-    # one (h_k, w_k) per orientation of every level, each level half as large as the
-    # previous one
-    bands: list[list[Image]]
-    low: Image  # (h_n, w_n)
-
-    def parts(self) -> list[Image]:
-        """High-pass residual, every band, low-pass residual: 2 + levels x orientations images."""
-        return [self.high, *(band for level in self.bands for band in level), self.low]
-
-    def with_parts(self, parts: list[Image]) -> Pyramid:
-        """A pyramid of this layout with other images, in the order of `parts`."""
-        ends = np.cumsum([1, *(len(level) for level in self.bands)]).tolist()
-        bands = [parts[start:end] for start, end in pairwise(ends)]
-        return Pyramid(parts[0], bands, parts[-1])
-
-
 def build(
     image: Image, levels: int = LEVELS, orientations: int = ORIENTATIONS
-) -> Pyramid:
-    """Decompose an image, which is extended periodically.
+) -> list[Image]:
+    """Decompose an image, which is extended periodically, into the parts of a pyramid.
 
     Parameters
     ----------
@@ -83,9 +59,10 @@ def build(
 
     Returns
     -------
-    Pyramid
-        `reconstruct` returns the image to within 1e-12 of its range in double
-        precision, 1e-6 in single precision.
+    list
+        High-pass residual (h, w), bands of every level, the finest first, and low-pass
+        residual: 2 + levels x orientations images. `reconstruct` returns the image to
+        within 1e-12 of its range in double precision, 1e-6 in single precision.
 
     Raises
     ------
@@ -108,39 +85,38 @@ def build(
     shape = image.shape
     kind: Any = image.dtype.type
     low, high = _low(shape, shape, 0, kind)
-    residual = _image(spectrum * high, shape)
-    bands = []
+    parts = [_image(spectrum * high, shape)]
     spectrum *= low
     size = shape
     for level in range(levels):
         low, high = _low(size, shape, level + 1, kind)
         ring = spectrum * high * _phase(orientations, kind)
         masks = _angular(size, shape, orientations, kind)
-        bands.append([_image(ring * mask, size) for mask in masks])
+        parts += [_image(ring * mask, size) for mask in masks]
         size = tuple((side + 1) // 2 for side in size)
         spectrum = _cropped(spectrum * low, size)
-    return Pyramid(residual, bands, _image(spectrum, size))
+    return [*parts, _image(spectrum, size)]
 
 
-def reconstruct(pyramid: Pyramid) -> Image:
-    """Rebuild the image of a pyramid as the sum of its parts, filtered with the masks
-    of the decomposition.
+def reconstruct(parts: Sequence[Image], orientations: int = ORIENTATIONS) -> Image:
+    """Rebuild an image from the parts of its pyramid as their sum, filtered with the
+    masks of the decomposition.
     """
-    shape = pyramid.high.shape
-    kind: Any = pyramid.high.dtype.type
-    spectrum = _transform(pyramid.low)
-    for level in reversed(range(len(pyramid.bands))):
-        bands = pyramid.bands[level]
-        size = bands[0].shape
-        low, high = _low(size, shape, level + 1, kind)
+    shape = parts[0].shape
+    kind: Any = parts[0].dtype.type
+    spectrum = _transform(parts[-1])
+    starts = range(1, len(parts) - 1, orientations)
+    for level, start in reversed([*enumerate(starts, start=1)]):
+        size = parts[start].shape
+        low, high = _low(size, shape, level, kind)
         ring = np.zeros(low.shape, spectrum.dtype)
-        masks = _angular(size, shape, len(bands), kind)
-        for band, mask in zip(bands, masks, strict=True):
-            ring += _transform(band) * mask
-        ring *= high * np.conj(_phase(len(bands), kind))
+        masks = _angular(size, shape, orientations, kind)
+        for part, mask in zip(parts[start : start + orientations], masks, strict=True):
+            ring += _transform(part) * mask
+        ring *= high * np.conj(_phase(orientations, kind))
         spectrum = ring + _widened(spectrum, size) * low
     low, high = _low(shape, shape, 0, kind)
-    return _image(spectrum * low + _transform(pyramid.high) * high, shape)
+    return _image(spectrum * low + _transform(parts[0]) * high, shape)
 
 
 def _frequencies(
@@ -246,7 +222,7 @@ def image_parts(
     image: Image, levels: int = LEVELS, orientations: int = ORIENTATIONS
 ) -> list[Image]:
     """An image (h, w) and the parts of its pyramid, the high-pass residual first."""
-    return [image, *build(image, levels, orientations).parts()]
+    return [image, *build(image, levels, orientations)]
 
 
 def part_names() -> list[str]:
@@ -398,19 +374,18 @@ def synthesise(
     image = image + NOISE * change * rng.standard_normal(image.shape)
     trace = []
     for _ in range(iterations):
-        image = matching.matched(image, 0, matching.quantiles(image, 0))
-        pyramid = build(image, levels, orientations)
-        parts = pyramid.parts()
-        quantiles = matching.all_quantiles([image, *parts])
+        image = matching.matched(image, 0, matching.quantiles([image])[:, 0])
+        parts = build(image, levels, orientations)
+        quantiles = matching.quantiles([image, *parts])
         trace.append(matching.distance(quantiles))
         parts = [
             matching.matched(part, k, quantiles[:, k])
             for k, part in enumerate(parts, start=1)
         ]
-        image = reconstruct(pyramid.with_parts(parts))
-    image = matching.matched(image, 0, matching.quantiles(image, 0))
+        image = reconstruct(parts, orientations)
+    image = matching.matched(image, 0, matching.quantiles([image])[:, 0])
     parts = image_parts(image, levels, orientations)
-    trace.append(matching.distance(matching.all_quantiles(parts)))
+    trace.append(matching.distance(matching.quantiles(parts)))
     return Synthesis(image, tuple(trace))
 
 
@@ -422,7 +397,6 @@ class _Matching:
     total: list[Image]  # sum of the fractions over the regions, for each part
     measured: list[list[Index]]  # entries that are measured, see `part_members`
     targets: Float64  # (region, part, QUANTILES)
-    size: Float64  # (part,) number of entries
 
     @classmethod
     def of(
@@ -438,25 +412,19 @@ class _Matching:
         counted = [part_members(m, parts) for m in measured or regions]
         sources = np.stack([part_quantiles(parts, inside) for inside in counted])
         sums = np.where(np.isfinite(shifts), sources + shifts, sources)
-        size = np.array([part.size for part in parts], float)
-        return cls(blend, total, counted, valid_quantiles(sums), size)
+        return cls(blend, total, counted, valid_quantiles(sums))
 
-    def quantiles(self, part: Image, k: int) -> Float64:
-        """Quantile functions (region, QUANTILES) of part k."""
+    def quantiles(self, parts: Sequence[Image]) -> Float64:
+        """Quantile functions (region, part, QUANTILES) of the first parts."""
         return np.stack(
-            [quantile_function(part.take(inside[k])) for inside in self.measured]
+            [part_quantiles(parts, inside[: len(parts)]) for inside in self.measured]
         )
 
-    def all_quantiles(self, parts: list[Image]) -> Float64:
-        """Quantile functions (region, part, QUANTILES)."""
-        rows = [self.quantiles(part, k) for k, part in enumerate(parts)]
-        return np.stack(rows, axis=1)
-
     def distance(self, quantiles: Float64) -> float:
-        """RMS difference from the targets."""
+        """RMS difference from the targets, by the number of entries of the parts."""
+        size = np.array([total.size for total in self.total], float)
         squares = np.nan_to_num(((quantiles - self.targets) ** 2).mean(axis=-1))
-        count = self.size.sum() * len(self.blend)
-        return float(np.sqrt((squares * self.size).sum() / count))
+        return float(np.sqrt(np.average(squares.mean(axis=0), weights=size)))
 
     def matched(self, part: Image, k: int, quantiles: Float64) -> Image:
         """Part k, whose values are mapped to the targets by their rank in each region."""

@@ -11,7 +11,7 @@ from types import NoneType
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-import xarray as xr
+from xarray import Dataset, Variable
 
 from skindb.errors import Fault, InputError, few_names, input_error
 from skindb.schema.label import label, text_labels
@@ -61,7 +61,7 @@ class Source(Protocol):
         """Values of a variable."""
 
 
-def values_of(ds: xr.Dataset, name: str) -> Values:
+def values_of(ds: Dataset, name: str) -> Values:
     """Values of a variable of a Dataset."""
     variables = ds.variables
     variable = variables[name]
@@ -90,14 +90,14 @@ class Part:
 class Held:
     """A Dataset in memory as the source of a part."""
 
-    ds: xr.Dataset
+    ds: Dataset
 
     def read(self, name: str) -> Values:
         """Values of a variable of the Dataset."""
         return values_of(self.ds, name)
 
     @classmethod
-    def part(cls, take: str, coords: Mapping[str, Any], ds: xr.Dataset) -> Part:
+    def part(cls, take: str, coords: Mapping[str, Any], ds: Dataset) -> Part:
         """The part of a cohort that a Dataset is."""
         labels = {
             str(dim): ds[dim].values.tolist() for dim in ds.dims if dim in ds.coords
@@ -160,7 +160,7 @@ def combine(
     variables: Iterable[str] | None = None,
     sizes: Mapping[str, int] | None = None,
     attrs: Mapping[str, Any] | None = None,
-) -> xr.Dataset:
+) -> Dataset:
     """The Dataset of many takes, lazy, with the dim "take" in front.
 
     Parameters
@@ -214,7 +214,7 @@ def combine(
     for name in dict.fromkeys(name for part in parts for name in part.coords):
         values = column([part.coords.get(name) for part in parts])
         coords[name if name not in taken else f"attribute_{name}"] = (TAKE, values)
-    return xr.Dataset(arrays, coords, dict(attrs or {}))
+    return Dataset(arrays, coords, dict(attrs or {}))
 
 
 def column(values: Sequence[Any]) -> AnyArray:
@@ -239,7 +239,7 @@ def column(values: Sequence[Any]) -> AnyArray:
     return np.array(known, np.int64 if is_whole else np.float64)
 
 
-def one_take_each(cohort: xr.Dataset) -> xr.Dataset:
+def one_take_each(cohort: Dataset) -> Dataset:
     """One take of every subject, in the condition normal, along the dim "subject".
 
     A subject who was measured only in other conditions is skipped and named in the
@@ -264,7 +264,7 @@ def one_take_each(cohort: xr.Dataset) -> xr.Dataset:
     return picked.assign_attrs(skipped=lines)
 
 
-def require_takes(cohort: xr.Dataset, layout: str) -> None:
+def require_takes(cohort: Dataset, layout: str) -> None:
     """Raise `InputError` if a cohort has no dimension "take", or is not of the layout
     "tables" or "maps".
     """
@@ -280,14 +280,14 @@ def require_takes(cohort: xr.Dataset, layout: str) -> None:
         )
 
 
-def require_comparable(cohort: xr.Dataset, layout: str) -> None:
+def require_comparable(cohort: Dataset, layout: str) -> None:
     """`require_takes`, and `require_same_fit` unless the attribute ``mixed_fits`` is set."""
     require_takes(cohort, layout)
     if not cohort.attrs.get("mixed_fits"):
         require_same_fit(cohort)
 
 
-def require_same_fit(cohort: xr.Dataset) -> None:
+def require_same_fit(cohort: Dataset) -> None:
     """Raise `InputError` if takes of a cohort were fitted with different parameters.
 
     Results of such takes differ for that reason too: a refractive index of 1.4 instead
@@ -426,7 +426,7 @@ def _lazy(
     sources: Iterable[Source | None],
     extent: Mapping[str, int],
     labels: Mapping[str, Sequence[Any]],
-) -> xr.Variable:
+) -> Variable:
     """A variable of every take, in blocks of few bytes; selected takes are read alone."""
     # a third of the start-up of `skindb info`, which forms no arrays
     import dask.array as da
@@ -451,7 +451,7 @@ def _lazy(
         meta=np.empty((0,) * stack.ndim, stack.dtype),
     )
     plain = label(name, np.zeros((0,) * len(dims)))
-    return xr.Variable((TAKE, *dims), data, plain.attrs)
+    return Variable((TAKE, *dims), data, plain.attrs)
 
 
 def _absent(name: str, shape: tuple[int, ...]) -> AnyArray:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
-import xarray as xr
+from xarray import Dataset, Variable
 
 from skindb.errors import Fault, InputError
 from skindb.schema.declaration import flag_attrs
@@ -24,7 +24,7 @@ def take_attrs(attrs: Mapping[Any, Any]) -> dict[Any, Any]:
     return {name: attrs[name] for name in TAKE_ATTRS if name in attrs}
 
 
-def label(name: str, data: Any) -> xr.Variable:
+def label(name: str, data: Any) -> Variable:
     """The variable `name` around `data` (numpy or dask); dims, dtype, units and
     description are the schema's.
 
@@ -44,7 +44,7 @@ def label(name: str, data: Any) -> xr.Variable:
     if spec.statuses is not None:
         attrs |= flag_attrs(spec.statuses)
     array = data if hasattr(data, "dask") else np.asarray(data)
-    return xr.Variable(spec.dims, array.astype(spec.dtype, copy=False), attrs)
+    return Variable(spec.dims, array.astype(spec.dtype, copy=False), attrs)
 
 
 def dataset(
@@ -52,12 +52,12 @@ def dataset(
     *,
     coords: Mapping[str, Any] | None = None,
     attrs: Mapping[str, Any] | None = None,
-) -> xr.Dataset:
+) -> Dataset:
     """A Dataset of schema variables; `coords` maps a dim to its labels (strings become
     variable-length text).
     """
     index = {dim: text_labels(values) for dim, values in (coords or {}).items()}
-    return xr.Dataset(
+    return Dataset(
         {name: label(name, data) for name, data in variables.items()},
         index,
         dict(attrs or {}),
@@ -70,7 +70,7 @@ def text_labels(values: Any) -> np.ndarray[Any, Any]:
     return array.astype(np.dtypes.StringDType()) if array.dtype.kind in "UO" else array
 
 
-def check(ds: xr.Dataset, names: Iterable[str], *, where: str = "dataset") -> None:
+def check(ds: Dataset, names: Iterable[str], *, where: str = "dataset") -> None:
     """Raise `InputError` with every fault of the variables `names` in `ds` (absent,
     dims, dtype, units).
 
@@ -88,7 +88,7 @@ def check(ds: xr.Dataset, names: Iterable[str], *, where: str = "dataset") -> No
         raise InputError(faults)
 
 
-def _faults(ds: xr.Dataset, name: str, where: str) -> list[Fault]:
+def _faults(ds: Dataset, name: str, where: str) -> list[Fault]:
     spec = VARIABLES[name]
     place = f"{where}[{name}]"
     if name not in ds.variables:

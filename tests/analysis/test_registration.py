@@ -27,7 +27,6 @@ from benchmarks.registration import correspondence_error, mask_agreement, unregi
 from skindb.analysis.albedo import albedo_histograms
 from skindb.analysis.regions import (
     FINE,
-    inside_outline,
     region_masks,
     take_masks,
 )
@@ -358,20 +357,6 @@ def test_region_masks__skips_regions_that_cannot_be_drawn():
     assert set(region_masks(TEXELS, some)) == set()
     some = {name: p for name, p in FACE.items() if "ala" not in name}
     assert set(region_masks(TEXELS, some)) == set(PLACE) - {"nose", "cheek", "no_beard"}
-
-
-def test_inside_outline__is_odd_winding():
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        outline = rng.normal(size=(9, 2))
-        points = rng.normal(size=(500, 2))
-        inside = inside_outline(points, outline)
-        angles = np.arctan2(*(outline[None] - points[:, None])[..., ::-1].T).T
-        turns = np.diff(np.concatenate([angles, angles[:, :1]], axis=1), axis=1)
-        winding = np.rint(
-            ((turns + np.pi) % (2 * np.pi) - np.pi).sum(axis=1) / (2 * np.pi)
-        ).astype(int)
-        np.testing.assert_array_equal(inside, winding % 2 == 1)
 
 
 @pytest.mark.slow

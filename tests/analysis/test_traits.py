@@ -263,7 +263,6 @@ def test_apply_traits__mean_albedo_moves_by_the_mean_difference():
         "basis": basis,
         "albedo": albedo,
         "tables": TABLES,
-        "parts": ("albedo",),
     }
     mean = albedo["albedo_mean"].sel(region="face")
     want = mean.sel(take=["B", "C"]).mean("take").values - mean.sel(take="A").values
