@@ -317,9 +317,12 @@ def _recovered(results: Results, _: Portraits) -> dict[str, Any]:
         "basis_size": plot_png(plot_basis_size(curve, ax=axes())),
     }
     near = 100 * float(curve[variables.PLATEAU_TOLERANCE])
+    sites = site_table(results)
+    header = ["take", "site", "red [%]", "green [%]", "blue [%]"]
     return {
         "plots": plots,
-        "sites": site_table(results),
+        "sites": sites,
+        "site_errors": sites.set_axis(header, axis=1),
         "basis_size": curve,
         "plateau_percent": near,
     }
