@@ -379,5 +379,5 @@ def _write(file: Path, content: bytes) -> None:
     temporary = file.with_name(f".{file.name}.tmp")
     write_private(temporary, content)
     flush_path(temporary)
-    temporary.replace(file)
+    temporary.rename(file)  # which replaces it
     flush_path(file.parent)
