@@ -267,8 +267,7 @@ def basis_size_curve(
         `relative_error` with its interval; `smallest_size` and `sufficient_size`, the
         bounds of the smallest size on the plateau (`sufficient_size` is 0 if there is
         no plateau); `plateau_tolerance`; `dictionary_error`, the relative RMS residual
-        with the whole dictionary. Attributes: `size_status`, the result as a sentence,
-        and `surfels`, their number.
+        with the whole dictionary. Attribute: `surfels`, their number.
     """
     require_comparable(cohort, "surfels")
     same_dictionary(cohort)

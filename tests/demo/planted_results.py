@@ -166,11 +166,7 @@ def _studies(takes: tuple[str, ...]) -> dict[str, xr.DataTree]:
                 {"channel": channel, "site": ["cheek", "forehead"], "group": ["all"]},
             )
         },
-        "brdf": {
-            "basis_size": xr.Dataset(
-                curve, {"k": sizes}, {"size_status": "3 to 4", "surfels": 400}
-            )
-        },
+        "brdf": {"basis_size": xr.Dataset(curve, {"k": sizes}, {"surfels": 400})},
         "albedo": {
             "albedo": xr.Dataset(albedo, where | {"take": list(takes)}),
             "albedo_table": grouped,
