@@ -33,8 +33,7 @@ from skindb.types import (
 # of the spread of the points: half a millimetre on a face, less than the error of a
 # click
 SAME_POINT_FRACTION = 0.01
-# for errors of clicks of 1 to 2 mm; the condition number for 20 points of a face is
-# then about 50
+# for errors of clicks of 1 to 2 mm
 SMOOTHING = 0.1
 WEAK_SMOOTHING_FACTOR = 3.0  # smoothing at a weak point relative to other points
 LOOSENING = (1.0, 4.0, 16.0, 64.0)  # weak points give way before others do
