@@ -233,15 +233,17 @@ def area_factor(warp: Warp, uv: Array) -> Float64:
 def left_out_error(warp: Warp) -> Float64:
     """Leave-one-out error (k,): distance of each point from its image by the map of the others.
 
-    NaN for points that are not used, and if there is no thin-plate map. The others
-    include weak points.
+    NaN for points that are not used or without which the others lie on a line, and if
+    there is no thin-plate map. The others include weak points.
     """
     out = np.full(len(warp.used), np.nan)
     if warp.spline is not None:
         spline = warp.spline
         for i, place in enumerate(np.flatnonzero(warp.used)):
-            image = spline.without(i).map(spline.centre[i : i + 1])[0]
-            out[place] = np.linalg.norm(image - spline.goal[i])
+            others = spline.without(i)
+            if width(others.centre) >= MIN_WIDTH_RATIO:
+                image = others.map(spline.centre[i : i + 1])[0]
+                out[place] = np.linalg.norm(image - spline.goal[i])
     return out
 
 

@@ -263,6 +263,15 @@ def test_left_out_error__is_that_of_maps_without_the_point(smoothing):
     assert np.isnan(left_out_error(fit_warp(FACE[:3], target[:3]))).all()
 
 
+def test_left_out_error__of_the_only_point_beside_a_line_is_unknown():
+    points = np.array([[0.5, 0.1], [0.5, 0.4], [0.5, 0.8], [0.3, 0.5]])
+    warp = fit_warp(points, points + 0.01 * np.eye(4, 2))
+    assert warp.kind == "thin plate"
+    np.testing.assert_array_equal(
+        np.isfinite(left_out_error(warp)), [True, True, True, False]
+    )
+
+
 @pytest.mark.parametrize(
     ("points", "kind"),
     [
