@@ -102,10 +102,13 @@ def distant_lights(environment: Environment, count: int = COUNT) -> DistantLight
     points = direction[lit]
     weight = bright[lit]
     chosen = np.arange(len(points))
-    if len(points) > MAX_TEXELS:  # drawn by their light instead of weighted by it
+    if len(points) > MAX_TEXELS:
+        # drawn by their light, each once, so that a sun leaves some for the sky; those
+        # that are drawn for certain are weighted by their light
         rng = np.random.default_rng(0)
-        chosen = rng.choice(len(points), MAX_TEXELS, p=weight / weight.sum())
-        weight = np.ones(len(points))
+        share = weight / weight.sum()
+        chosen = rng.choice(len(points), MAX_TEXELS, replace=False, p=share)
+        weight = np.maximum(share, 1 / MAX_TEXELS)
     clusters = KMeans(min(count, len(points)), random_state=0, max_iter=ROUNDS)
     clusters.fit(points[chosen], sample_weight=weight[chosen])
     found, label = np.unique(clusters.predict(points), return_inverse=True)

@@ -75,3 +75,14 @@ def test_distant_lights__of_a_single_texel():
     np.testing.assert_allclose(
         lights.irradiance[0] / lights.irradiance[0, 0], [1, 2, 3]
     )
+
+
+def test_distant_lights__of_a_sun_that_outshines_a_large_sky():
+    radiance = np.ones((80, 160, 3))
+    radiance[10, 30] = 1e8
+    environment = Environment(radiance)
+    lights = distant_lights(environment)
+    normal = np.concatenate([np.eye(3), -np.eye(3)])
+    np.testing.assert_allclose(
+        of_lights(lights, normal), irradiance(environment, normal), rtol=0.1
+    )
