@@ -208,7 +208,9 @@ def _mixtures(dictionary) -> None:
         "\n| mixture of embedded materials | above | median rms error | worst |\n|---|---|---|---|"
     )
     for lowest, degrees in ((0.1, 6), (0.3, 17), (0.5, 30)):
-        pairs = sample_pairs(6000, lowest)
+        pairs = sample_pairs(6000)
+        up = np.minimum(pairs[0][:, 2], pairs[1][:, 2]) > lowest
+        pairs = pairs[0][up], pairs[1][up]
         angles = half_difference(*pairs)
         want = lookup(dictionary.table, *angles)
         bases = lookup(embedded_dictionary().table, *angles)

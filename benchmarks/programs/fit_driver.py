@@ -34,7 +34,8 @@ from skindb.fit import (
     reduce_basis,
 )
 from skindb.fit.lumitexels import block_of, disc_angle, lumitexels, take_noise
-from skindb.fit.surface import MIN_SAMPLES, NEEDED, noise_floor, refit_and_evaluate
+from skindb.fit.surface import NEEDED, noise_floor, refit_and_evaluate
+from skindb.reflectance._lumitexel_kernels import MIN_SAMPLES_GLOSS
 from skindb.reflectance.dictionary import disc_dictionary
 from skindb.reflectance.kinds import surface_model
 from skindb.reflectance.mixture import Mixture
@@ -145,7 +146,7 @@ def _linear_refit(fitted: xr.Dataset, basis: xr.Dataset) -> Callable[[], Any]:
     """Weights and residuals without their errors."""
     arrays = {name: fitted[name].values for name in NEEDED}
     block = block_of(arrays, take_noise(fitted))
-    comparison = Comparison("linear", 1.3, noise_floor(fitted), MIN_SAMPLES)
+    comparison = Comparison("linear", 1.3, noise_floor(fitted), MIN_SAMPLES_GLOSS)
     surface = surface_model(basis)
     return lambda: surface.fit(block, comparison, Judgement())
 
