@@ -202,8 +202,8 @@ def _regions(fitted: xr.Dataset) -> dict[str, NDArray[Any]]:
 
 
 def _quantiles(values: NDArray[Any], area: NDArray[Any]) -> NDArray[Any]:
-    """Area-weighted quantiles; NaN without values."""
-    finite = np.isfinite(values)
+    """Area-weighted quantiles; NaN without values that have an area."""
+    finite = np.isfinite(values) & (area > 0)
     if not finite.any():
         return np.full(len(QUANTILES), np.nan)
     quantiles = np.quantile(
@@ -216,7 +216,7 @@ def _quantiles(values: NDArray[Any], area: NDArray[Any]) -> NDArray[Any]:
 
 
 def _mean(values: NDArray[Any], area: NDArray[Any]) -> float:
-    finite = np.isfinite(values)
+    finite = np.isfinite(values) & (area > 0)
     return (
         float(np.average(values[finite], weights=area[finite]))
         if finite.any()

@@ -119,6 +119,16 @@ def test_prediction_table__agrees_with_numpy_for_equal_areas():
             )
 
 
+def test_prediction_table__surfels_without_area_have_no_weight():
+    """The only clamped surfel is the corner of triangles without area."""
+    table = prediction_table(_fitted(surfel_area=[1, 1, 1, 7, 0, 100]))
+    clamped = table.sel(status="diffuse_clamped", region="face")
+    assert clamped["prediction_surfels"] == 1
+    assert np.isnan(clamped["prediction_error"]).all()
+    assert np.isnan(clamped["prediction_outlier_fraction"])
+    assert np.isfinite(_error(table, samples="fit")).all()
+
+
 def test_prediction_table__needs_status_and_area():
     with pytest.raises(InputError, match="fit_status"):
         prediction_table(_fitted().drop_vars("fit_status"))
