@@ -130,8 +130,10 @@ class Subjects:
     @property
     def is_normal(self) -> Mask:
         """Mask (take,) of the takes in the condition normal."""
-        conditions = self.attribute(CONDITION).values
-        return np.array([value in (NORMAL, None) for value in conditions], bool)
+        if CONDITION not in self.attributes:
+            return np.ones(len(self.take), bool)
+        conditions = self.attributes[CONDITION].values
+        return np.array([value == NORMAL for value in conditions], bool)
 
     @property
     def names(self) -> tuple[str, ...]:
