@@ -45,6 +45,8 @@ from skindb.store.stage import Stage
 from skindb.store.stale import REQUESTS
 
 LOCK = f"{WITHDRAWN}/{RESTORING}"
+# folders that a restore has written before its first file
+OF_A_RESTORE = (STAGING, WITHDRAWN, "leases")
 
 
 @dataclass(frozen=True)
@@ -148,8 +150,9 @@ def _write(archive: Archive, place: Place, plan: Plan) -> tuple[int, list[Record
     """Write the files of a database, which is locked meanwhile, and the later consents;
     returns the number of bytes, and the records of these consents.
     """
-    place.create(LOCK, b"{}")
     with Lease(place, "restore", (RELEASE,), command="skindb restore"):
+        _require_empty(place)  # another restore may have been completed meanwhile
+        place.create(LOCK, b"{}")
         written = _copy_all(archive, place, plan)
         consents = _repeat_consents(place, plan)
         place.remove(LOCK)
@@ -207,7 +210,7 @@ def _require_empty(place: Place) -> None:
     if place.file_type(LOCK):
         return
     names = place.names() or []
-    foreign = [name for name in names if name not in (STAGING, WITHDRAWN)]
+    foreign = [name for name in names if name not in OF_A_RESTORE]
     if foreign or place.sizes(WITHDRAWN):
         finding = (
             "a database or a backup"
@@ -241,7 +244,7 @@ def _remove_left(place: Place) -> None:
         if name != RESTORING:
             place.remove(f"{WITHDRAWN}/{name}")
     for top in place.names() or []:
-        if top not in (STAGING, WITHDRAWN, "leases"):
+        if top not in OF_A_RESTORE:
             place.remove(top)
 
 

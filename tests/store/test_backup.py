@@ -19,7 +19,7 @@ from traces import MARK, contents, traces
 from skindb import workflow
 from skindb.errors import InputError
 from skindb.schema import dataset
-from skindb.store import Database, LeaseLost, backup_states, restore
+from skindb.store import Database, LeaseLost, backup_states, restore, restoring
 from skindb.store import backup as backup_module
 from skindb.store import lease as lease_module
 from skindb.store.archive import Archive
@@ -768,6 +768,27 @@ def test_restore__that_was_interrupted_before_a_withdrawal_keeps_nothing_of_the_
     assert traces(target, SUBJECT) == []
     assert copy.verify() == []
     assert copy.takes("model") == ["B"]
+
+
+def test_restore__beside_one_that_is_completed_meanwhile_changes_nothing(
+    db, dest, tmp_path, monkeypatch
+):
+    db.backup(str(dest))
+    target = tmp_path / "copy"
+    place_at(str(target)).create(restoring.LOCK, b"{}")  # one is running
+    plan = restoring._plan
+
+    def late(*arguments):
+        monkeypatch.setattr(restoring, "_plan", plan)
+        _restored(db, dest, target)
+        _commit(target, "capture", "D")
+        return plan(*arguments)
+
+    monkeypatch.setattr(restoring, "_plan", late)
+    with pytest.raises(InputError, match="found a database"):
+        _restored(db, dest, target)
+    assert Database(target).takes() == ["B", "D", SUBJECT]
+    assert Database(target).verify() == []
 
 
 def test_backup__from_a_folder_to_a_bucket_and_back(
