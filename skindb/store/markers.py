@@ -331,9 +331,9 @@ def _note(
     path = place.marker_file()
     try:
         secret = require_secret(place)
-        with _locked(path.parent):
-            # a link to another disk stays
-            file = path.resolve()
+        # a link to another disk stays
+        file = Path(os.path.realpath(path))
+        with _locked(file.parent):
             notes = read_marker_file(path, secret) if file.exists() else Notes()
             before = seal_of(asdict(notes))
             add(notes, secret)

@@ -188,6 +188,20 @@ def test_marker_file__can_be_a_link_to_another_disk(db, tmp_path):
     assert (other / "faces.markers").is_file()
 
 
+def test_marker_file__of_two_links_has_one_lock(place, tmp_path, monkeypatch):
+    folders = []
+    monkeypatch.setattr(
+        fcntl, "flock", lambda number, _: folders.append(os.fstat(number).st_ino)
+    )
+    for name in "ab":
+        file = tmp_path / name / "db.markers"
+        file.parent.mkdir()
+        file.symlink_to(tmp_path / "markers")
+        monkeypatch.setattr(type(place), "marker_file", lambda _, file=file: file)
+        markers.note_withdrawals(place)
+    assert {*folders} == {tmp_path.stat().st_ino}
+
+
 def test_marker_file__that_was_lost_is_written_again(db):
     db.erase(SUBJECT)
     before = _notes(db)
