@@ -11,6 +11,7 @@ import pandas as pd
 import xarray as xr
 
 from skindb.errors import Fault, InputError, input_error, require
+from skindb.files import make_private
 from skindb.schema.consent import CONSENT, require_consent
 from skindb.store.archive import Archive
 from skindb.store.arrays import open_version
@@ -39,6 +40,7 @@ from skindb.store.erasure import (
     holdings_of,
     subject_holdings,
 )
+from skindb.store.folder import SHARED_MODES
 from skindb.store.garbage import Garbage, find_garbage, remove_garbage
 from skindb.store.lease import LEASE_SECONDS, Lease
 from skindb.store.log import Log
@@ -108,6 +110,13 @@ class Database:
     def scratch(self) -> Path:
         """Path of a local folder for temporary files of this database, which may not exist yet."""
         return self.place.scratch()
+
+    def make_scratch(self, folder: Path) -> None:
+        """Create a folder for temporary files, and its parents, with the permissions of
+        the database, so that others who may write the database can work and remove it.
+        """
+        if self.folder is not None:
+            make_private(folder, self.folder.stat().st_mode & SHARED_MODES)
 
     def names(self) -> list[str] | None:
         """Names at the top level of the folder or bucket; None if the database does not

@@ -31,6 +31,9 @@ MAX_FOLDER_DEPTH = 16
 # to write a file whose temporary file is removed, or to remove a folder in which files
 # are written
 MAX_ATTEMPTS = 10
+# permissions of a database that its folders have too: those of owner and group, and the
+# setgid bit, which new folders inherit
+SHARED_MODES = 0o2770
 TYPES = ((stat.S_ISDIR, "folder"), (stat.S_ISREG, "file"), (stat.S_ISLNK, "link"))
 
 
@@ -293,8 +296,7 @@ class Folder:
         """Permissions of folders and files: those of the root for owner and group, none
         for other users.
         """
-        # including the setgid bit, which new folders inherit
-        folders = self.root.stat().st_mode & 0o2770
+        folders = self.root.stat().st_mode & SHARED_MODES
         return folders, folders & 0o660
 
     def _flush_parents(self, place: Path) -> None:

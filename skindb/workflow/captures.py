@@ -200,6 +200,7 @@ def _ingest(
         # what was recorded since counts, not the folder
         if db.has(CONSENT, subject_of(capture.take)):
             db.require_consent(capture.take, "fit")
+        db.make_scratch(scratch.parent)
         with (
             one_blas_thread(),
             ingest_capture(

@@ -87,7 +87,7 @@ def fit_take(
                 first_tree = first_pass(
                     capture, requested, dictionary=dictionary, progress=progress
                 )
-                _store_first_pass(scratch, take, first_tree)
+                _store_first_pass(db, scratch, take, first_tree)
             elif progress is not None:
                 progress("first pass of the run before", 1, 1)
             model = second_pass(
@@ -144,11 +144,14 @@ def _stored_first_pass(scratch: Path, take: str) -> xr.DataTree | None:
     return first_pass_tree
 
 
-def _store_first_pass(scratch: Path, take: str, first_tree: xr.DataTree) -> None:
+def _store_first_pass(
+    db: Database, scratch: Path, take: str, first_tree: xr.DataTree
+) -> None:
     """Keep a first pass for the case that the fit is killed, in a database of its own,
     whose name contains a digest of all that decides the model.
     """
     shutil.rmtree(scratch, ignore_errors=True)  # a damaged one
+    db.make_scratch(scratch / "data")
     with Database(scratch).stage("model", take) as stage:
         stage.write(groups_of(first_tree))
         stage.commit({str(name): value for name, value in first_tree.attrs.items()})

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import stat
 from dataclasses import replace
 
 import pytest
@@ -152,6 +153,14 @@ def test_first_pass__is_no_result_and_leaves_nothing(killed):
     _fit(killed)
     assert [*killed.scratch().iterdir()] == []
     assert killed.garbage() == []
+
+
+def test_first_pass__lets_others_work_in_a_shared_database(db, monkeypatch):
+    db.root.chmod(0o2770)
+    _kill(db, monkeypatch)
+    [scratch] = db.scratch().iterdir()
+    for folder in (db.scratch(), scratch, scratch / "data" / "model"):
+        assert stat.S_IMODE(folder.stat().st_mode) == 0o2770
 
 
 def test_first_pass__of_another_fit_is_removed(killed):
