@@ -422,7 +422,9 @@ def _cost(parts: Lengths, factor: Mapping[str, float]) -> float:
         return inf
     if height and not FACE_HEIGHTS[0] <= height <= FACE_HEIGHTS[1]:
         return inf
-    cost = abs(log(height / FACE_HEIGHT if height else diagonal / HEAD_DIAGONAL))
+    # both, so that landmarks in another unit than that of the scan cost something
+    cost = abs(log(diagonal / HEAD_DIAGONAL))
+    cost += abs(log(height / FACE_HEIGHT)) if height else 0.0
     for part in parts.devices:
         ratio = factor[part] / factor[SCAN]
         far = parts.distance(part, ratio) / parts.sizes[SCAN]
