@@ -306,16 +306,18 @@ def _has_ended(place: Place, claim: Claim) -> bool:
     """Whether the holder of a claim released it, has ended, or has not renewed it in time.
 
     A file from the future is that of a holder that has not renewed it since the clock of
-    the storage was set back.
+    the storage was set back; on this machine, a holder that has not ended will do so.
     """
     holder = claim.body.get("holder")
-    if claim.is_released or (isinstance(holder, dict) and has_ended(holder)):
+    holder = holder if isinstance(holder, dict) else {}
+    if claim.is_released or has_ended(holder):
         return True
     try:
         written = place.modified(_file_key(claim.key, claim.number))
     except FileNotFoundError:  # removed meanwhile
         return False
-    return abs(storage_time(place) - written) > claim.seconds
+    age = storage_time(place) - written
+    return age > claim.seconds or (age < -claim.seconds and not _is_here(holder))
 
 
 def storage_time(place: Place) -> float:
@@ -396,10 +398,9 @@ def has_ended(holder: Mapping[str, Any]) -> bool:
     """Whether a process described by `this_process` has certainly ended; False for a
     process of another machine.
     """
-    here = _machine()
     number = holder.get("process")
     started = holder.get("started")
-    if not all(here[name] and here[name] == holder.get(name) for name in MACHINE_KEYS):
+    if not _is_here(holder):
         return False
     if not isinstance(number, int) or not 0 < number < 1 << 31 or not started:
         return False
@@ -411,6 +412,11 @@ def has_ended(holder: Mapping[str, Any]) -> bool:
         pass
     now = _start(number)
     return now not in (started, None)
+
+
+def _is_here(holder: Mapping[str, Any]) -> bool:
+    here = _machine()
+    return all(here[name] and here[name] == holder.get(name) for name in MACHINE_KEYS)
 
 
 def _machine() -> dict[str, str]:

@@ -225,6 +225,15 @@ def test_lease__from_the_future_is_free(db, monkeypatch):
         lease.require()
 
 
+def test_lease__from_the_future_stays_with_a_holder_on_this_machine(db):
+    """The clock of the storage was set back, and the holder renews it in some seconds."""
+    with _hold(db) as lease:
+        _age(_files(db)[0], -3e7)
+        with pytest.raises(InputError, match="one run at a time"), _hold(db):
+            pass
+        lease.require()
+
+
 def test_lease__that_is_damaged_ends_like_any_other(db):
     _abandon(db)
     (file,) = _files(db)
