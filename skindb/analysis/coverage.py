@@ -145,10 +145,12 @@ def _factors(
             factors[AGE_BAND] = _single(bands)
         elif not attribute.is_numeric and 1 <= len(attribute.words) <= MAX_VALUES:
             factors[name] = _single(attribute.values)
-    conditions = takes.attribute(CONDITION).values
+    conditions = np.full(len(takes.take), NORMAL, object)
+    if CONDITION in takes.attributes:
+        conditions[:] = takes.attributes[CONDITION].values
     rows = [np.flatnonzero(takes.rows_of(name)) for name in takes.names]
     factors[CONDITION] = [
-        frozenset(str(conditions[i] or NORMAL) for i in of_subject)
+        frozenset(str(v) for v in conditions[of_subject] if v is not None)
         for of_subject in rows
     ]
     if variables.SITE_STATUS in cohort:
