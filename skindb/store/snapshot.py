@@ -234,7 +234,13 @@ class Lookup:
 
 
 def list_records(place: Place, kind: str = "") -> dict[Key, str]:
-    """Identity of the file of every record in the log, of one kind or of all kinds."""
+    """Identity of the file of every record in the log, of one kind or of all kinds.
+
+    Raises
+    ------
+    InputError
+        If the log holds heads: its folder, or that of a kind, was exchanged with theirs.
+    """
     identities: dict[Key, str] = {}
     for name, identity in place.identities(f"log/{kind}".rstrip("/")).items():
         path = f"{kind}/{name}" if kind else name
@@ -242,6 +248,13 @@ def list_records(place: Place, kind: str = "") -> dict[Key, str]:
         match = GENERATION.fullmatch(file)
         if match and re.fullmatch(KIND, listed_kind) and re.fullmatch(TAKE, take):
             identities[listed_kind, take, int(match[1])] = identity_text(identity)
+        elif re.fullmatch(KIND, listed_kind) and take.endswith(".json"):
+            raise input_error(
+                place.where(f"log/{path}"),
+                "the log must hold records, each in the folder of its take",
+                "a file that belongs into heads/",
+                "move it back, or restore the folders log and heads from a backup",
+            )
     return identities
 
 

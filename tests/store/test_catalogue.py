@@ -241,6 +241,16 @@ def test_takes__a_folder_in_place_of_a_record_hides_no_take(db):
     assert "fault" in db.info()["takes"]["C3"]["capture"]
 
 
+def test_takes__log_and_heads_that_were_exchanged_are_named(db):
+    log, heads = (db.root / name / "capture" for name in ("log", "heads"))
+    log.rename(log.with_name("aside"))
+    heads.rename(log)
+    log.with_name("aside").rename(heads)
+    with pytest.raises(InputError, match=r"log/capture/\w+\.json: the log must hold"):
+        db.takes("capture")
+    assert any("must exist" in str(fault) for fault in db.verify())
+
+
 def test_info__where_agrees_with_the_table(db):
     with pytest.warns(skindb.store.MissingWarning, match="C3"):
         found = db.info(where="age > 20")["takes"]
