@@ -36,7 +36,6 @@ from skindb.format.scan_checks import (
     SITE_LANDMARK,
     SIZES,
     Lengths,
-    capture_lengths,
     coincidence_faults,
     crop_path,
     device_faults,
@@ -209,8 +208,7 @@ class _Reader:
             self.probe = read_probe(self.folder, probe)
         self._require_sites(landmarks, regions)
         if self.unit_faults and scan is not None:
-            middles = _middles(scan, regions)
-            lengths = capture_lengths(scan, landmarks, middles, self.dome)
+            lengths = Lengths(scan, landmarks, _middles(scan, regions), self.dome)
             self.faults += self._joint_unit_fault(lengths) or self.unit_faults
         if not fields.has("mesh"):
             self._require_one_camera()

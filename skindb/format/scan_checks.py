@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from skindb.errors import Fault, few_names, input_error
+from skindb.errors import Fault, input_error
 from skindb.format.dome import CameraRecord, DomeRecord
 from skindb.geometry.clean import CleanMesh
 from skindb.geometry.mesh import (
@@ -24,7 +24,7 @@ from skindb.geometry.mesh import (
     winding_number,
 )
 from skindb.geometry.scan import Crop, Scan
-from skindb.types import Float64, lengths
+from skindb.types import Float64
 
 UNITS = {
     "metres": 1000.0,
@@ -90,6 +90,7 @@ MIN_LIGHT_RATIO = 0.6
 # logarithm of a factor, of lengths that are as far from the usual ones as one more
 # part, or one more unit, is unlikely
 PART_COST = UNIT_COST = 0.7
+MAX_VERTICES = 5_000  # of a scan, for its span in the pictures
 # of a point inside; outside the convex hull of a surface it is at most 0.5
 MIN_WINDING_NUMBER = 0.5
 # of the longest side of a picture. Heads in a dome span 0.7 to 1; ten times too far
@@ -347,91 +348,119 @@ def is_point(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class Lengths:
-    """Parts of a capture, as far as they are known; `face` is the height of the face by
-    named regions of the scan, 0 if unknown.
+    """Parts of a capture, as far as they are known; `middles` are the centres of named
+    regions of the scan.
     """
 
     scan: Scan
     landmarks: Mapping[str, Float64]
-    face: float
-    devices: Mapping[str, Float64]  # positions (n, 3) of CAMERAS and LIGHTS
+    middles: Mapping[str, Float64]
+    dome: DomeRecord | None
 
     @cached_property
     def sizes(self) -> dict[str, float]:
         """A length of each part: diagonal, height of the face, median distances from
         the centre of the scan.
         """
-        sizes = {SCAN: float(np.linalg.norm(np.ptp(self.scan.vertices, axis=0)))}
+        vertices = self.scan.vertices
+        sizes = {SCAN: float(np.linalg.norm(np.ptp(vertices, axis=0)))}
         if (height := face_height(self.landmarks)) is not None:
             sizes[LANDMARKS] = height
-        return sizes | {part: self.distance(part) for part in self.devices}
+        if self.dome is not None and self.dome.cameras:
+            sizes[CAMERAS] = self.distance([c.centre for c in self.dome.cameras])
+        if self.dome is not None and self.dome.lights:
+            sizes[LIGHTS] = self.distance([x.position for x in self.dome.lights])
+        return sizes
 
-    @cached_property
-    def _centre(self) -> Float64:
-        return np.asarray(self.scan.vertices.mean(axis=0))
-
-    def distance(self, part: str, factor: float = 1.0) -> float:
-        """Median distance from the centre of the scan of devices this many times away."""
-        return float(np.median(lengths(factor * self.devices[part] - self._centre)))
-
-
-def capture_lengths(
-    scan: Scan,
-    landmarks: Mapping[str, Float64],
-    middles: Mapping[str, Float64],
-    dome: DomeRecord | None,
-) -> Lengths:
-    """The lengths of a capture; `middles` are the centres of named regions of the scan."""
-    devices = dict[str, Float64]()
-    if dome is not None and dome.cameras:
-        devices[CAMERAS] = np.array([camera.centre for camera in dome.cameras])
-    if dome is not None and dome.lights:
-        devices[LIGHTS] = np.array([light.position for light in dome.lights])
-    return Lengths(scan, landmarks, face_height(middles) or 0.0, devices)
+    def distance(self, positions: list[Float64], factor: float = 1.0) -> float:
+        """Median distance from the centre of the scan of positions times a factor."""
+        away = factor * np.array(positions) - self.scan.vertices.mean(axis=0)
+        return float(np.median(np.linalg.norm(away, axis=1)))
 
 
-def likely_units(parts: Lengths) -> dict[str, str]:
+def likely_units(lengths: Lengths) -> dict[str, str]:
     """The unit of each part that is not in mm; empty if all of them may be, or if no
     units make a capture of a head.
 
     Of all combinations, the one is chosen in which lengths are closest to those of
     heads in domes, and in which the fewest parts are in the fewest other units.
     """
+    parts = [*lengths.sizes]
+    ratios = {a / b for a, b in product(MM.values(), repeat=2)}
+    near = {}
+    if LANDMARKS in parts:
+        near = {ratio: _landmark_distance(lengths, ratio) for ratio in ratios}
+    views = {ratio: _device_costs(lengths, ratio) for ratio in ratios}
     best = dict[str, str]()
     lowest = inf
-    for names in product(MM, repeat=len(parts.sizes)):
-        units = dict(zip(parts.sizes, names, strict=True))
+    for names in product(MM, repeat=len(parts)):
+        units = dict(zip(parts, names, strict=True))
         other_units = {part: unit for part, unit in units.items() if MM[unit] != 1}
         cost = PART_COST * len(other_units) + UNIT_COST * max(len({*names}) - 1, 0)
-        cost += _cost(parts, {part: MM[unit] for part, unit in units.items()})
+        if cost < lowest:
+            factors = {part: MM[unit] for part, unit in units.items()}
+            cost += _cost(lengths, factors, near, views)
         if cost < lowest:
             best = other_units
             lowest = cost
     return best
 
 
-def _cost(parts: Lengths, factor: Mapping[str, float]) -> float:
+def _cost(
+    lengths: Lengths,
+    factor: Mapping[str, float],
+    near: Mapping[float, float],
+    views: Mapping[float, Mapping[str, float]],
+) -> float:
     """Sum of the logarithms by which lengths differ from the usual ones; infinite for
     lengths that are impossible.
     """
-    diagonal = factor[SCAN] * parts.sizes[SCAN]
-    height = factor[SCAN] * parts.face
-    if LANDMARKS in factor:
-        height = factor[LANDMARKS] * parts.sizes[LANDMARKS]
+    sizes = {part: factor[part] * size for part, size in lengths.sizes.items()}
+    diagonal = sizes[SCAN]
+    height = sizes.get(LANDMARKS, (face_height(lengths.middles) or 0.0) * factor[SCAN])
     if not SCAN_DIAGONAL[0] <= diagonal <= SCAN_DIAGONAL[1]:
         return inf
-    if height and not FACE_HEIGHTS[0] <= height <= FACE_HEIGHTS[1]:
-        return inf
-    # both, so that landmarks in another unit than that of the scan cost something
     cost = abs(log(diagonal / HEAD_DIAGONAL))
-    cost += abs(log(height / FACE_HEIGHT)) if height else 0.0
-    for part in parts.devices:
-        ratio = factor[part] / factor[SCAN]
-        far = parts.distance(part, ratio) / parts.sizes[SCAN]
-        if far < MIN_LIGHT_RATIO:
+    if height:
+        if not FACE_HEIGHTS[0] <= height <= FACE_HEIGHTS[1]:
             return inf
-        cost += abs(log(far / DOME_RADIUS_RATIO))
+        cost = abs(log(height / FACE_HEIGHT))
+    if LANDMARKS in factor:
+        reach = LANDMARK_REACH / factor[SCAN]
+        if min(near.values()) < reach < near[factor[LANDMARKS] / factor[SCAN]]:
+            return inf
+    for part in (CAMERAS, LIGHTS):
+        if part in factor:
+            cost += views[factor[part] / factor[SCAN]][part]
     return cost
+
+
+def _landmark_distance(lengths: Lengths, ratio: float) -> float:
+    """Median distance of the landmarks from the scan, in its unit, if they are this
+    many times larger.
+    """
+    points = ratio * np.array([*lengths.landmarks.values()])
+    distances = closest_on_mesh(lengths.scan.vertices, lengths.scan.faces, points)[2]
+    return float(np.median(distances))
+
+
+def _device_costs(lengths: Lengths, ratio: float) -> dict[str, float]:
+    """Costs of cameras and lights that are this many times farther away, in the unit of
+    the scan.
+    """
+    dome = lengths.dome
+    if dome is None:
+        return {}
+    vertices = lengths.scan.vertices[:: -(-len(lengths.scan.vertices) // MAX_VERTICES)]
+    spans = [picture_span(camera, vertices, factor=ratio) for camera in dome.cameras]
+    finite = [span for span in spans if span is not None and np.isfinite(span)]
+    camera_cost = inf
+    if 2 * len(finite) >= len(spans):
+        camera_cost = abs(log(float(np.median(finite)) / USUAL_SPAN))
+    positions = [light.position for light in dome.lights]
+    far = lengths.distance(positions, ratio) / lengths.sizes[SCAN]
+    light_cost = abs(log(far / DOME_RADIUS_RATIO)) if far >= MIN_LIGHT_RATIO else inf
+    return {CAMERAS: camera_cost, LIGHTS: light_cost}
 
 
 def unit_text(units: Mapping[str, str]) -> str:
@@ -466,13 +495,15 @@ def device_faults(where: str, dome: DomeRecord, surface: CleanMesh) -> list[Faul
                 f"{key} must be within {MAX_DEVICE_DISTANCE_MM / 1000:g} m of the "
                 "origin of the scan's frame"
             )
-            finding = f"{len(far)} of {len(positions)} farther: {few_names(far)}"
+            finding = f"{len(far)} of {len(positions)} farther: {_first_names(far)}"
             faults.append(
                 Fault(f"{where}[{key}]", rule, finding, "give positions in mm")
             )
         if inner:
             rule = f"{key} must be outside the head"
-            finding = f"{len(inner)} of {len(positions)} inside it: {few_names(inner)}"
+            finding = (
+                f"{len(inner)} of {len(positions)} inside it: {_first_names(inner)}"
+            )
             faults.append(
                 Fault(
                     f"{where}[{key}]",
@@ -482,6 +513,10 @@ def device_faults(where: str, dome: DomeRecord, surface: CleanMesh) -> list[Faul
                 )
             )
     return faults
+
+
+def _first_names(names: list[str]) -> str:
+    return ", ".join(names[:3]) + ", .." * (len(names) > 3)
 
 
 def dome_unit_faults(
@@ -565,14 +600,18 @@ def _inside(surface: CleanMesh, point: Float64) -> bool:
     return bool(number > MIN_WINDING_NUMBER)
 
 
-def picture_span(camera: CameraRecord, vertices: Float64) -> float | None:
+def picture_span(
+    camera: CameraRecord, vertices: Float64, *, factor: float = 1.0
+) -> float | None:
     """Fraction of the picture's side that the scan spans; None if it is outside the
     picture or behind the camera.
+
+    The camera is taken to be `factor` times as far away.
 
     Distortion is ignored, and the picture is extended by half its size: only scans
     clearly outside count as invisible.
     """
-    local = vertices @ camera.R.T + camera.t
+    local = vertices @ camera.R.T + factor * camera.t
     behind = local[:, 2] <= 0
     if behind.all():
         return None

@@ -5,7 +5,6 @@ ones that can be are not.
 from __future__ import annotations
 
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,15 +13,8 @@ from sphere import RADIUS, half_sphere, look_at
 
 from skindb.errors import InputError
 from skindb.format.scan_checks import (
-    CAMERAS,
-    LANDMARKS,
-    LIGHTS,
-    MM,
-    SCAN,
-    Lengths,
     coincidence_faults,
     landmark_faults,
-    likely_units,
     order_faults,
     scan_faults,
     swapped_faults,
@@ -676,23 +668,3 @@ def test_read_capture__refuses_a_crop_file_outside_the_folder(capture_folder, tm
         InputError, match="every path must stay inside the capture folder"
     ):
         read_capture(capture_folder)
-
-
-@pytest.mark.parametrize("unit", [1.0, 10.0, 1000.0, 1e-3])
-def test_likely_units__of_a_capture_in_one_unit(unit):
-    """All parts have it, although the proportions are not exactly the usual ones."""
-    corners = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
-    scan = SimpleNamespace(vertices=100 * corners / unit)
-    landmarks = {
-        "forehead_centre": np.array([0.0, 40.0, 90.0]) / unit,
-        "chin": np.array([0.0, -40.0, 90.0]) / unit,
-    }
-    devices = {
-        part: np.array([[distance, 0.0, 0.0]]) / unit
-        for part, distance in ((CAMERAS, 1100.0), (LIGHTS, 1300.0))
-    }
-    found = likely_units(Lengths(scan, landmarks, 0.0, devices))
-    parts = () if unit == 1 else (SCAN, LANDMARKS, CAMERAS, LIGHTS)
-    assert {part: MM[name] for part, name in found.items()} == dict.fromkeys(
-        parts, unit
-    )
