@@ -77,9 +77,31 @@ def _commit_hostile(root, change: dict, take: str = "A1") -> None:
     """Commit a version whose metadata were changed before they were sealed."""
     with Database(root).stage("capture", take) as stage:
         stage.write(groups())
-        path = root / stage.path / AREA
-        path.write_text(json.dumps(json.loads(path.read_text()) | change))
+        write_metadata = stage._write_metadata
+
+        def write_hostile_metadata(attrs: dict) -> None:
+            write_metadata(attrs)
+            for path in (root / stage.path).rglob("zarr.json"):
+                content = json.loads(path.read_text())
+                if path == root / stage.path / AREA:
+                    content |= change
+                else:
+                    _change_copies(content, change)
+                path.write_text(json.dumps(content))
+
+        stage._write_metadata = write_hostile_metadata
         stage.commit({"consent_scope": ["fit", "statistics"], "subject": take})
+
+
+def _change_copies(content: object, change: dict) -> None:
+    """Change the copies of the metadata of the array in those of its groups."""
+    if not isinstance(content, dict):
+        return
+    for name, node in content.items():
+        if name.rpartition("/")[2] == AREA.split("/")[-2]:
+            node |= change
+        else:
+            _change_copies(node, change)
 
 
 @pytest.mark.slow
