@@ -87,7 +87,7 @@ def fit(db: Database, tell: Tell, _: Path | None = None) -> int:
         ("second_pass", FIT[3]),
     ):
         setattr(fit_module, name, _telling(getattr(fit_module, name), stage, tell))
-    _tell_stages("model", tell)
+    _tell_stages(db, "model", tell)
     return workflow.fit_take(
         db, FIT_TAKE, PARAMETERS, dictionary=few_materials()
     ).generation
@@ -101,7 +101,7 @@ def ingest(db: Database, tell: Tell, work: Path) -> int:
     ingest_module.ingest_capture = _telling(
         ingest_module.ingest_capture, INGEST[1], tell
     )
-    _tell_stages("capture", tell)
+    _tell_stages(db, "capture", tell)
     return workflow.ingest_take(db, work / "folder", photographs=1).generation
 
 
@@ -117,18 +117,23 @@ def _telling(call, stage: str, tell: Tell):
     return called
 
 
-def _tell_stages(kind: str, tell: Tell) -> None:
-    """Report when a version of a kind is written and committed, and what follows."""
+def _tell_stages(db: Database, kind: str, tell: Tell) -> None:
+    """Report when a version of a kind is written and committed, and what follows; the
+    first pass of a fit has a database of its own, which is not reported.
+    """
     write = Stage.write
     commit = Stage.commit
 
+    def is_told(stage: Stage) -> bool:
+        return stage.log.kind == kind and stage.place is db.place
+
     def writing(stage, *args, **options):
-        if stage.log.kind == kind:
+        if is_told(stage):
             tell("write")
         write(stage, *args, **options)
 
     def committing(stage, provenance):
-        if stage.log.kind != kind:
+        if not is_told(stage):
             return commit(stage, provenance)
         tell("commit")
         record = commit(stage, provenance)
