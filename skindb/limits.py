@@ -55,6 +55,8 @@ MAX_RECHECKED_BYTES = 1_000 * MB
 
 # of commands; sizes beyond these are typing errors, and most would not fit into memory
 MAX_COHORT = 10_000  # simulated subjects
+MAX_VIRTUAL_VISITS = 100  # of a simulated subject
+MAX_VISIT = 9999  # visits of a subject in a condition, and repeats of a visit
 MAX_DEMO_TAKES = 8  # of the people of the demo
 MAX_VIRTUAL_PIXELS = 8_000_000  # of a simulated frame, which needs 250 bytes each
 # of a picture rendered at another scale, which needs 700 bytes each

@@ -17,7 +17,7 @@ import numpy as np
 from xarray import Dataset
 
 from skindb.errors import Fault, InputError, input_error
-from skindb.numerics.statistics import Moments
+from skindb.numerics.statistics import Moments, known_mean
 from skindb.schema.notes import Note, note
 from skindb.types import Array, Mask
 
@@ -31,7 +31,7 @@ ALL_TAKES = "all"
 UNKNOWN = "unknown"
 OTHER = "other conditions"
 # coordinates along "take" that describe no subject
-NO_ATTRIBUTES = ("take", "subject", "session", "model_generation")
+NO_ATTRIBUTES = ("take", "subject", "visit", "repeat", "session", "model_generation")
 FIT = "fit_"  # prefix of coordinates that are parameters of the fit
 
 
@@ -227,9 +227,18 @@ class Groups:
     attrs: dict[str, Any]  # of a table of the groups
 
     def moments(self, values: Array) -> Moments:
-        """Moments (group, ...) of values (take, ...)."""
-        members = self.members.values()
-        return Moments.stacked(Moments.of(values[rows]) for rows in members)
+        """Moments (group, ...), over subjects, of values (take, ...)."""
+        return Moments.stacked(
+            Moments.of(self._of_subjects(values, rows))
+            for rows in self.members.values()
+        )
+
+    def _of_subjects(self, values: Array, rows: Sequence[int]) -> Array:
+        """Means (subject, ...) over the takes of each subject in these rows."""
+        of_subject: dict[str, list[int]] = {}
+        for row in rows:
+            of_subject.setdefault(self.subject[row], []).append(row)
+        return np.stack([known_mean(values[takes]) for takes in of_subject.values()])
 
 
 def grouped(cohort: Dataset, group_by: str | None) -> Groups:
@@ -244,6 +253,18 @@ def grouped(cohort: Dataset, group_by: str | None) -> Groups:
         "skipped": list(cohort.attrs.get("skipped", [])),
     }
     return Groups(takes, subjects.subject, dict(sorted(members.items())), attrs)
+
+
+def describe_visits(cohort: Dataset) -> str:
+    """Which of repeated takes of a subject in a condition are used; empty if there are none."""
+    takes = list(zip(cohort["subject"].values, cohort["condition"].values, strict=True))
+    if len(set(takes)) == len(takes):
+        return ""
+    count = len(set(cohort["subject"].values))
+    return (
+        f"{len(takes)} takes of {count} subjects; a subject counts with the mean over its "
+        "visits and repeats in a condition"
+    )
 
 
 def level_error(takes: Dataset) -> float:

@@ -33,8 +33,8 @@ from skindb.cli.shared import (
     summary_of,
 )
 from skindb.cli.terminal import bar, echo
-from skindb.errors import input_error
-from skindb.limits import MAX_COHORT, MAX_DEMO_TAKES
+from skindb.errors import require
+from skindb.limits import MAX_COHORT, MAX_DEMO_TAKES, MAX_VIRTUAL_VISITS, MAX_VISIT
 from skindb.parameters import (
     CONDITIONS,
     DemoParameters,
@@ -92,6 +92,12 @@ def demo(out: Path, parameters: DemoParameters) -> None:
         "several times)."
     ),
 )
+@click.option(
+    "--visits",
+    type=click.IntRange(1, MAX_VIRTUAL_VISITS),
+    default=1,
+    help="Number of visits of each subject of the cohort.",
+)
 @options_of(SimulationParameters)
 @WORKERS
 def simulate(
@@ -99,6 +105,7 @@ def simulate(
     takes: int,
     cohort: int | None,
     conditions: tuple[str, ...],
+    visits: int,
     parameters: SimulationParameters,
 ) -> None:
     """Write virtual captures with their true values beside them.
@@ -108,9 +115,10 @@ def simulate(
     interrupted run, and a larger number adds subjects.
     """
     progress = bar()
-    if conditions and cohort is None:
-        raise input_error(
-            "--condition",
+    for option, is_given in (("condition", conditions), ("visits", visits > 1)):
+        require(
+            not is_given or cohort is not None,
+            f"--{option}",
             "belongs to a cohort",
             "no --cohort",
             "give the number of subjects",
@@ -118,7 +126,9 @@ def simulate(
     people = (
         None
         if cohort is None
-        else skindb.workflow.begin_cohort(out, cohort, conditions, parameters)
+        else skindb.workflow.begin_cohort(
+            out, cohort, conditions, parameters, visits=visits
+        )
     )
     call = partial(
         skindb.workflow.simulate_one, out, parameters, people=people, progress=progress
@@ -136,6 +146,14 @@ def _simulated(simulated: tuple[int, Path]) -> tuple[str, Any, list[str]]:
 @DB
 @click.argument("captures", metavar="CAPTURE...", nargs=-1, required=True, type=PATH)
 @options_of(IngestParameters)
+@click.option(
+    "--visit",
+    type=click.IntRange(1, MAX_VISIT),
+    help=(
+        "Visit of the captures.  [default: what capture.json states; otherwise that of "
+        "the same session, or the next one]"
+    ),
+)
 @click.option(
     "--crop-box",
     type=Finite(),
@@ -163,6 +181,7 @@ def _simulated(simulated: tuple[int, Path]) -> tuple[str, Any, list[str]]:
 def ingest(
     db: str,
     captures: tuple[Path, ...],
+    visit: int | None,
     crop_box: Any,
     crop_reach: float | None,
     again: bool,
@@ -176,15 +195,19 @@ def ingest(
     does not stop the others. An interrupted ingest leaves no incomplete version, and
     the same command resumes it. Nothing is done if the newest version was made of the
     same files, with the same parameters, by the same code. A capture of a subject who
-    was withdrawn is refused.
+    was withdrawn is refused. The same session of a subject in a condition is a new
+    version of its take, and another session is the next visit unless a visit is stated.
     """
     low, high = (crop_box[:3], crop_box[3:]) if crop_box else (None, None)
     crop = skindb.ingest.Crop(low, high, crop_reach) if crop_box or crop_reach else None
     progress = bar()
     database = skindb.open(db)
+    folders = [shared_path(folder) for folder in captures]
     call = partial(
         skindb.workflow.ingest_if_changed,
         database,
+        visit=visit,
+        planned={} if visit else skindb.workflow.next_visits(database, folders),
         again=again,
         crop=crop,
         wait=wait,
@@ -192,7 +215,6 @@ def ingest(
         **asdict(parameters),
     )
     finish = partial(_ingested, database, explain=explain)
-    folders = [shared_path(folder) for folder in captures]
     with _logged(database, folders):
         results, faults = each_take(
             call,

@@ -280,13 +280,15 @@ def _report(
         "units": units,
         "rows": rows,
         "notes": notes,
+        "visits": attrs.get("visits", ""),
         "skipped": attrs["skipped"],
     }
     hidden = skindb.analysis.STUDIES[study.name].columns_of_files
     columns = [i for i, name in enumerate(header) if name not in hidden]
     table = aligned([[line[i] for i in columns] for line in [header, *rows]])
     table += _unit_lines(units, [header[i] for i in columns])
-    emit(report, [*table, *notes, *lines])
+    visits = [f"visits: {attrs['visits']}"] if attrs.get("visits") else []
+    emit(report, [*visits, *table, *notes, *lines])
 
 
 def _unit_lines(units: dict[str, str], columns: list[str]) -> list[str]:

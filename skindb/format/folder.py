@@ -53,9 +53,9 @@ from skindb.format.scan_checks import (
 )
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.geometry.scan import Crop, Scan, crop_faces, read_scan
-from skindb.limits import MAX_FRAMES, MAX_OBJECT_KEYS, MAX_REGIONS
+from skindb.limits import MAX_FRAMES, MAX_OBJECT_KEYS, MAX_REGIONS, MAX_VISIT
 from skindb.parameters import SCAN_ERROR_DEGREES
-from skindb.schema.cohort import imitates_column
+from skindb.schema.cohort import imitates_column, take_name
 from skindb.types import Float64, Index
 
 Point = Float64  # (3,) mm
@@ -81,6 +81,8 @@ class Capture:
     subject: str
     session: str
     condition: str
+    visit: int | None  # None if capture.json states none
+    repeat: int
     traits: Mapping[str, Any]
     consent_scope: tuple[str, ...]
     consent_reference: str
@@ -114,9 +116,8 @@ class Capture:
 
     @property
     def take(self) -> str:
-        """Name of the take: the subject, followed by the condition unless that is normal."""
-        condition = "" if self.condition == "normal" else f".{self.condition}"
-        return f"{self.subject}{condition}"
+        """Name of the take, in the first visit if none is stated."""
+        return take_name(self.subject, self.condition, self.visit or 1, self.repeat)
 
 
 def read_capture(path: str | Path, *, crop: Crop | None = None) -> Capture:
@@ -243,6 +244,13 @@ class _Reader:
             "session": fields.text("session"),
             "traits": self._traits(),
         }
+        for key, default in (("visit", None), ("repeat", 1)):
+            record[key] = default
+            if self._has_in_version_2(key):
+                record[key] = fields.integer(key, minimum=1, maximum=MAX_VISIT)
+        if record["visit"] is None and record["repeat"] != 1:
+            rule = "a repeat belongs to a visit"
+            fields.fault("repeat", rule, shown(record["repeat"]), "state the visit too")
         if record["session"] and zoned_time(record["session"]) is None:
             fields.fault(
                 "session",

@@ -20,6 +20,7 @@ from skindb.schema.variables import VARIABLES
 from skindb.types import AnyArray
 
 TAKE = "take"
+NORMAL = "normal"  # the condition of bare skin
 # of a variable of a cohort in one task; maps and samples of takes are larger
 MAX_BLOCK_TAKES = 256
 MAX_BLOCK_BYTES = 1 << 22
@@ -42,9 +43,28 @@ OF_MODEL = ("dictionary", "dictionary_digest", *EVEN)
 FIT_COORDS = {f"fit_{name}": name for name in (*COMPARED, *EVEN)}
 # columns of the catalogue and coordinates of cohorts that are no attributes
 COLUMN = re.compile(
-    r"take|subject|condition|session|consent|outdated|(fit|status|attribute)_.*|(.*_)?(generation|created)",
+    r"take|subject|condition|visit|repeat|session|consent|outdated|(fit|status|attribute)_.*|(.*_)?(generation|created)",
     re.DOTALL,
 )
+
+
+def take_name(
+    subject: str, condition: str = NORMAL, visit: int = 1, repeat: int = 1
+) -> str:
+    """`<subject>[.<condition>[.<visit>[.<repeat>]]]`; at the end, the condition normal,
+    the first visit and the first repeat are left out.
+    """
+    parts = [subject, condition, visit, repeat]
+    while parts[-1] == (None, NORMAL, 1, 1)[len(parts) - 1]:
+        parts.pop()
+    return ".".join(map(str, parts))
+
+
+def visit_of(take: str) -> tuple[int, int]:
+    """Visit and repeat of a take, by its name; 1 where it names none."""
+    numbers = [int(part) for part in take.split(".")[2:4] if part.isdecimal()]
+    visit, repeat = [*numbers, 1, 1][:2]
+    return visit, repeat
 
 
 class Values(NamedTuple):
@@ -78,7 +98,7 @@ class Part:
     """The Dataset of one take: its layout, and the source of its values."""
 
     take: str
-    # subject, condition, session, attributes and parameters of the fit
+    # subject, condition, visit, repeat, session, attributes and parameters of the fit
     coords: Mapping[str, Any]
     variables: Sequence[str]
     sizes: Mapping[str, int]
@@ -127,8 +147,8 @@ def attribute_name(name: str) -> str:
 def take_coords(
     take: str, attrs: Mapping[Any, Any], fit: Mapping[Any, Any] | None = None
 ) -> dict[str, Any]:
-    """Coordinates of one take: subject, condition, session, attributes, and the
-    parameters of its fit.
+    """Coordinates of one take: subject, condition, visit, repeat, session, attributes,
+    and the parameters of its fit.
 
     Parameters
     ----------
@@ -139,9 +159,12 @@ def take_coords(
     fit
         Attributes of its model, if there is one.
     """
+    visit, repeat = visit_of(take)
     coords = {
         "subject": str(attrs.get("subject", take)),
-        "condition": str(attrs.get("condition", "normal")),
+        "condition": str(attrs.get("condition", NORMAL)),
+        "visit": visit,
+        "repeat": repeat,
         "session": attrs.get("session"),
     }
     for name, value in dict(attrs.get("traits", {})).items():
@@ -240,7 +263,7 @@ def column(values: Sequence[Any]) -> AnyArray:
 
 
 def one_take_each(cohort: Dataset) -> Dataset:
-    """One take of every subject, in the condition normal, along the dim "subject".
+    """The first take of every subject in the condition normal, along the dim "subject".
 
     A subject who was measured only in other conditions is skipped and named in the
     attribute "skipped".
@@ -250,8 +273,12 @@ def one_take_each(cohort: Dataset) -> Dataset:
         for name in ("subject", "condition")
     )
     index_by_subject: dict[str, int] = {}
-    for i, (subject, condition) in enumerate(zip(subjects, conditions, strict=True)):
-        if condition == "normal":
+    order = sorted(
+        range(len(subjects)), key=lambda i: visit_of(str(cohort[TAKE].values[i]))
+    )
+    for i in order:
+        subject, condition = subjects[i], conditions[i]
+        if condition == NORMAL:
             index_by_subject.setdefault(subject, i)
     missing = sorted(set(subjects) - set(index_by_subject))
     lines = [

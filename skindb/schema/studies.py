@@ -7,7 +7,7 @@ TABLE_2 = f"{PAPER}, table 2"
 # translucency_table
 SIGMA_TR_COUNT = declare(
     "int32 translucency_table/sigma_tr_count(group, site, channel) [1]",
-    "takes with a trusted sigma_tr",
+    "subjects with a trusted sigma_tr",
     TABLE_2,
 )
 SIGMA_TR_MEAN = declare(
@@ -228,7 +228,7 @@ TEXTURE_REGION = declare(
 # albedo_table
 GROUP_ALBEDO_COUNT = declare(
     "int32 albedo_table/group_albedo_count(group, region, channel) [1]",
-    "takes that have the region",
+    "subjects that have the region",
 )
 GROUP_ALBEDO_MEAN = declare(
     "float64 albedo_table/group_albedo_mean(group, region, channel) [1]",

@@ -350,7 +350,7 @@ class Database:
             Names of takes, by default all. Takes whose consent does not cover
             statistics are skipped and listed in the attribute "skipped".
         dim
-            "take", or "subject" for one take per subject, in the condition normal.
+            "take", or "subject" for the first take of each subject, in the condition normal.
         surfels
             Number of surfels of each take; models store a random sample of 5,000.
         size
@@ -362,9 +362,9 @@ class Database:
         Returns
         -------
         Dataset
-            Coordinates along "take" are subject, condition, session, the attributes of
-            the captures, and the parameters of the fit as ``fit_k``, ``fit_eta`` and so
-            on. Values that a take does not have are NaN.
+            Coordinates along "take" are subject, condition, visit, repeat, session, the
+            attributes of the captures, and the parameters of the fit as ``fit_k``,
+            ``fit_eta`` and so on. Values that a take does not have are NaN.
 
         Raises
         ------
@@ -406,8 +406,8 @@ class Database:
         Returns
         -------
         DataFrame
-            Columns: subject, condition, session, the attributes of the captures, the
-            parameters of the fit as ``fit_k`` and so on, generation and date (UTC) of
+            Columns: subject, condition, visit, repeat, session, the attributes of the
+            captures, the parameters of the fit as ``fit_k`` and so on, generation and date (UTC) of
             capture, model and registration, consent, the fraction of surfels with each
             status of the fit, and whether there is a newer capture than that of the
             model (``outdated``). Values that a take does not have are NaN.

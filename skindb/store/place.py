@@ -28,7 +28,8 @@ KINDS_WITHOUT_SUBJECT = (STUDY, RELEASE, CALIBRATION)
 # kinds that hold data of their own subject only; an input of them is of that subject,
 # or a product that many share
 KINDS_OF_ONE_SUBJECT = ("capture", "model", "consent")
-TAKE = r"[A-Za-z0-9_-]{1,64}(\.[A-Za-z0-9_-]{1,64})?"
+# of a take, see `skindb.schema.cohort.take_name`, a study, a release or a calibration
+TAKE = r"[A-Za-z0-9_-]{1,64}(\.[A-Za-z0-9_-]{1,64}(\.[1-9][0-9]{0,3}){0,2})?"
 KIND = r"[a-z]{1,32}"
 GROUP = r"[a-z_]{1,32}"
 # start of the names of a version and of the files beside it
@@ -85,7 +86,7 @@ def in_parallel(function: Callable[[T], R], values: Iterable[T]) -> list[R]:
 
 
 def subject_of(take: str) -> str:
-    """The subject of a take, which is named `<subject>` or `<subject>.<condition>`."""
+    """The subject of a take, the first part of its name."""
     return take.partition(".")[0]
 
 

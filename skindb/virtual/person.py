@@ -9,8 +9,13 @@ import numpy as np
 
 from skindb.files import package_json
 from skindb.parameters import CONDITIONS
+from skindb.schema.cohort import take_name
 from skindb.virtual.face import FaceShape
 
+# standard deviations between visits, as fractions of those between subjects: blood follows
+# temperature and exertion of the day
+VISIT_MELANIN = 0.1
+VISIT_BLOOD = 0.4
 ANCESTRIES = ("european", "east_asian", "african", "south_asian")
 # subjects of the paper's table 1, dataset B: ancestries, gender, how many, least and
 # largest age, conditions
@@ -41,6 +46,7 @@ class Person:
     melanin: float = 0.0  # standard deviations from the mean of the group
     blood: float = 0.0  # standard deviations
     fullness: float = 0.5  # of the cheeks, 0 to 1
+    visit: int = 1
 
     def __post_init__(self) -> None:
         for value, allowed, name in (
@@ -55,12 +61,8 @@ class Person:
 
     @property
     def take(self) -> str:
-        """Key of this take: the subject, with the condition unless it is normal."""
-        return (
-            self.subject
-            if self.condition == "normal"
-            else f"{self.subject}.{self.condition}"
-        )
+        """Name of this take."""
+        return take_name(self.subject, self.condition, self.visit)
 
     def stream(self, purpose: int) -> np.random.Generator:
         """Random generator for this person, independent of the condition, with one
@@ -75,7 +77,11 @@ def default_people() -> tuple[Person, ...]:
 
 
 def cohort_people(
-    subjects: int = 87, *, conditions: Sequence[str] = (), seed: int = 2005
+    subjects: int = 87,
+    *,
+    conditions: Sequence[str] = (),
+    visits: int = 1,
+    seed: int = 2005,
 ) -> list[Person]:
     """A population with the groups and ages of the paper's table 1, dataset B.
 
@@ -89,6 +95,10 @@ def cohort_people(
         beyond 87. The first ones do not depend on the number.
     conditions
         Further conditions that every subject is also photographed in.
+    visits
+        Visits of every subject in every condition. With more than one, melanin and blood
+        vary between visits, normally with the standard deviations `VISIT_MELANIN` and
+        `VISIT_BLOOD`, about those of the subject.
     seed
         Random seed for the order, ages, skins and shapes.
     """
@@ -119,15 +129,24 @@ def cohort_people(
             blood=float(rng.normal(0, 1)),
             fullness=float(rng.uniform(0.3, 0.7)),
         )
-        people += [
-            person,
-            *(
-                replace(person, condition=condition)
-                for condition in conditions
-                if condition != person.condition
-            ),
-        ]
+        for condition in dict.fromkeys([person.condition, *conditions]):
+            worn_by = replace(person, condition=condition)
+            people += _at_visits(worn_by, visits) if visits > 1 else [worn_by]
     return people
+
+
+def _at_visits(person: Person, visits: int) -> list[Person]:
+    """A person at each visit, with the same skin in all conditions of a visit."""
+    deviations = person.stream(3).standard_normal((visits, 2))
+    return [
+        replace(
+            person,
+            visit=number,
+            melanin=person.melanin + VISIT_MELANIN * float(melanin),
+            blood=person.blood + VISIT_BLOOD * float(blood),
+        )
+        for number, (melanin, blood) in enumerate(deviations, 1)
+    ]
 
 
 def face_shape(person: Person) -> FaceShape:

@@ -24,6 +24,7 @@ from .captures import (
     describe_calibration,
     ingest_if_changed,
     ingest_take,
+    next_visits,
 )
 from .cohorts import register_takes, registered_datasets, summarise
 from .edits import basis_grid, edit, edit_grid
@@ -102,6 +103,7 @@ __all__ = [
     "landmark_page",
     "logged_action",
     "map_takes",
+    "next_visits",
     "parameters_of",
     "plan_session",
     "plan_take",

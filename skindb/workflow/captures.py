@@ -3,8 +3,10 @@ dated, versioned, and named by the captures that used them.
 """
 
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +32,7 @@ from skindb.calibration.setup import (
 from skindb.errors import Fault, InputError, add_filename, input_error, require
 from skindb.files import plain
 from skindb.format.dome import DomeRecord
-from skindb.format.fields import NAME, read_json
+from skindb.format.fields import NAME, read_json, zoned_time
 from skindb.format.frames import Digests
 from skindb.ingest import (
     Capture,
@@ -44,6 +46,7 @@ from skindb.ingest.report import capture_provenance
 from skindb.ingest.spool import remove_stale
 from skindb.parameters import CalibrationParameters
 from skindb.schema import variables
+from skindb.schema.cohort import NORMAL, take_name, visit_of
 from skindb.schema.consent import CONSENT
 from skindb.store import (
     CALIBRATION,
@@ -82,8 +85,9 @@ def ingest_take(db: Database, folder: str | Path, **options: Any) -> Record:
     **options
         `crop`: what to keep of the scan, a box or the surroundings of the landmarks, by
         default all of it. `wait`: seconds to wait for another run that ingests or fits
-        the same take. `progress`: called with the stage, the number of finished steps
-        and the total number of steps. Others are those of
+        the same take. `visit`: of the subject in the condition, by default what
+        capture.json states, or else by `next_visits`. `progress`: called with the stage,
+        the number of finished steps and the total number of steps. Others are those of
         `skindb.ingest.IngestParameters`: spacing_mm, photographs, calibration, refine.
 
     Returns
@@ -107,13 +111,16 @@ def ingest_if_changed(
     *,
     again: bool = False,
     crop: Crop | None = None,
+    visit: int | None = None,
+    planned: Mapping[Path, int] | None = None,
     wait: float = 0.0,
     progress: Progress | None = None,
     **parameters: Any,
 ) -> tuple[Record, bool]:
     """The record of a capture folder that is ingested, as by `ingest_take`, and True; or of
     the newest capture and False, if it was made of the same files, with the same
-    parameters, by the same code. With `again` it is always ingested.
+    parameters, by the same code. With `again` it is always ingested. Visits that
+    `next_visits` planned for several folders are `planned`.
     """
     database = None if db.folder is None else db.folder.resolve()
     require(
@@ -124,7 +131,8 @@ def ingest_if_changed(
         "choose another folder for the database",
     )
     capture = calibrated_capture(db, read_capture(folder, crop=crop))
-    capture = _with_note_of_session(db, capture)
+    is_stated = capture.visit is not None or visit is not None
+    capture = _at_visit(db, capture, visit, planned or {})
     record = IngestParameters(**parameters)
     if not again:
         stored = _unchanged(db, capture, record)
@@ -134,7 +142,8 @@ def ingest_if_changed(
     with logged_action(db, "ingest", [capture.take]):
         remove_stale(scratch)
         try:
-            return _ingest(db, capture, record, scratch, wait, progress), True
+            ingested = _ingest(db, capture, record, scratch, wait, progress, is_stated)
+            return ingested, True
         except (OSError, InputError):
             _require_admitted(db, capture.take, scratch)
             raise
@@ -157,18 +166,60 @@ def _unchanged(
     return record if same else None
 
 
-def _with_note_of_session(db: Database, capture: Capture) -> Capture:
-    """The capture, which says if it takes the place of one of another session."""
-    if not db.has("capture", capture.take):
-        return capture
-    earlier = db.record("capture", capture.take).provenance.get("session")
-    if earlier in (None, capture.session):
-        return capture
-    line = (
-        f"session {capture.session} takes the place of session {earlier} as the newest "
-        "capture; sessions that are compared need conditions of their own"
+def _at_visit(
+    db: Database, capture: Capture, visit: int | None, planned: Mapping[Path, int]
+) -> Capture:
+    """The capture at its visit: the stated one, or what `next_visits` finds."""
+    require(
+        visit is None or capture.visit in (None, visit),
+        f"{capture.folder / 'capture.json'}[visit]",
+        "the visit must be stated once",
+        f"{capture.visit}, and {visit} for this ingest",
+        "omit one of them",
     )
-    return replace(capture, skipped=(*capture.skipped, line))
+    visit = visit or capture.visit or planned.get(capture.folder)
+    return replace(
+        capture, visit=visit or next_visits(db, [capture.folder])[capture.folder]
+    )
+
+
+def next_visits(db: Database, folders: Sequence[str | Path]) -> dict[Path, int]:
+    """Visits of the capture folders that state none: that of the same session in the
+    database, or else the next ones of their subject and condition, in the order of the
+    sessions. Folders that cannot be read are omitted.
+    """
+    sessions = dict[tuple[str, str], list[tuple[datetime, Path, int | None]]]()
+    for folder in map(Path, folders):
+        record = read_json(folder / "capture.json", [])
+        about = record if isinstance(record, dict) else {}
+        time = zoned_time(str(about.get("session")))
+        if time is not None:
+            key = (str(about.get("subject")), str(about.get("condition", NORMAL)))
+            stated = about.get("visit") if about.get("version") != 1 else None
+            visit = stated if isinstance(stated, int) else None
+            sessions.setdefault(key, []).append((time, folder, visit))
+    takes = db.takes("capture")
+    visits = dict[Path, int]()
+    for key, captured in sessions.items():
+        # of a damaged record, which the ingest of the folder reports
+        with suppress(InputError) if len(folders) > 1 else nullcontext():
+            known = {
+                zoned_time(str(_session(db, take))): visit_of(take)[0]
+                for take in reversed(takes)
+                if take == take_name(*key, *visit_of(take))
+            }
+            known |= {time: visit for time, _, visit in captured if visit is not None}
+            for time, folder, visit in sorted(captured, key=lambda one: one[0]):
+                if visit is None:
+                    following = max(known.values(), default=0) + 1
+                    visits[folder] = known.setdefault(time, following)
+    return visits
+
+
+def _session(db: Database, take: str) -> str | None:
+    """Time of the session of the newest capture of a take."""
+    session: str | None = db.record("capture", take).provenance.get("session")
+    return session
 
 
 def captured_subjects(folders: Iterable[str | Path]) -> list[str]:
@@ -191,6 +242,7 @@ def _ingest(
     scratch: Path,
     wait: float,
     progress: Progress | None,
+    is_stated: bool,
 ) -> Record:
     lease = db.lease(
         capture.take, "capture", "model", wait=wait, command="skindb ingest"
@@ -200,6 +252,7 @@ def _ingest(
         # what was recorded since counts, not the folder
         if db.has(CONSENT, subject_of(capture.take)):
             db.require_consent(capture.take, "fit")
+        notes = _notes_on_visit(db, capture, is_stated=is_stated)
         db.make_scratch(scratch.parent)
         with (
             one_blas_thread(),
@@ -212,8 +265,33 @@ def _ingest(
             if progress is not None:
                 progress("write", 1, 1)
             provenance = {str(name): value for name, value in tree.attrs.items()}
-            digest = {"code_digest": _ingest_digest()}
-            return stage.commit(provenance | digest)
+            provenance["code_digest"] = _ingest_digest()
+            summary = provenance["summary"]
+            provenance["summary"] = summary | {"notes": [*notes, *summary["notes"]]}
+            return stage.commit(provenance)
+
+
+def _notes_on_visit(db: Database, capture: Capture, *, is_stated: bool) -> list[str]:
+    """A line on a visit that is new by its session, or on a session that replaces another."""
+    take = capture.take
+    if not db.has("capture", take):
+        new = not is_stated and capture.visit != 1
+        line = f"session {capture.session} is visit {capture.visit}: no visit is stated"
+        return [f"{line}, and it is another session than those before"] if new else []
+    earlier = _session(db, take)
+    if earlier is None or zoned_time(earlier) == zoned_time(capture.session):
+        return []
+    require(
+        is_stated,
+        take,
+        "a session without a stated visit must be a visit of its own",
+        f"session {earlier}, which another run ingested in the meantime",
+        "run the command again",
+    )
+    return [
+        f"session {capture.session} takes the place of session {earlier} as the newest "
+        "capture of this visit"
+    ]
 
 
 def _ingest_digest() -> str:

@@ -26,6 +26,7 @@ def simulate(
     takes: int = 8,
     cohort: int | None = None,
     conditions: Sequence[str] = (),
+    visits: int = 1,
     workers: int | None = None,
     progress: Progress | None = None,
     **options: Any,
@@ -44,6 +45,8 @@ def simulate(
         continues a run that was interrupted.
     conditions
         Conditions in which every subject of the cohort is photographed too.
+    visits
+        Visits of every subject of the cohort, see `skindb.virtual.person.cohort_people`.
     workers
         Number of takes at a time, each in its own process; default one, in this process.
     progress
@@ -67,7 +70,7 @@ def simulate(
     people = (
         None
         if cohort is None
-        else begin_cohort(Path(out), cohort, conditions, parameters)
+        else begin_cohort(Path(out), cohort, conditions, parameters, visits=visits)
     )
     call = partial(
         simulate_one, Path(out), parameters, people=people, progress=progress
@@ -87,12 +90,16 @@ def begin_cohort(
     subjects: int,
     conditions: Sequence[str],
     parameters: SimulationParameters,
+    *,
+    visits: int = 1,
 ) -> list[Person]:
     """The people of a cohort, whose parameters are noted in its folder, or compared
     with those that are noted there.
     """
     # which takes have which noise depends on the conditions
     options = asdict(parameters) | {"conditions": list(conditions)}
+    if visits > 1:
+        options["visits"] = visits
     note = out / COHORT
     if note.is_file():
         read = read_json(note, [])
@@ -119,7 +126,9 @@ def begin_cohort(
     else:
         make_private(out)
         private_file(note).write_text(json.dumps(options, indent=1), encoding="utf-8")
-    return cohort_people(subjects, conditions=conditions, seed=parameters.seed)
+    return cohort_people(
+        subjects, conditions=conditions, visits=visits, seed=parameters.seed
+    )
 
 
 def simulate_one(

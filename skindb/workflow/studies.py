@@ -20,7 +20,12 @@ from skindb.analysis.regions import common_landmarks
 from skindb.analysis.registration import describe_registration
 from skindb.analysis.studies import STUDIES
 from skindb.analysis.study import Population, Study
-from skindb.analysis.subjects import CONDITION, subjects_of, subjects_without_normal
+from skindb.analysis.subjects import (
+    CONDITION,
+    describe_visits,
+    subjects_of,
+    subjects_without_normal,
+)
 from skindb.errors import InputError, input_error, require
 from skindb.format.dome import EXPOSURE_RATIO
 from skindb.parameters import option_of, require_limits
@@ -499,6 +504,7 @@ def _derivation(
         seeds={"analyze": requested["seed"]} if "seed" in requested else {},
         skipped=skipped,
         outdated=outdated,
+        visits=describe_visits(cohort),
         attributes_digest=_attributes_digest(cohort),
     )
 

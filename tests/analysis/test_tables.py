@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from planted_population import model_of, population, surfels, tables
+from planted_tables import planted_tables
 
 from skindb.analysis import (
     albedo_histograms,
@@ -17,6 +18,7 @@ from skindb.analysis import (
 )
 from skindb.analysis.subjects import (
     comparable_takes,
+    describe_visits,
     groups_by,
     has_trait,
     known_traits,
@@ -48,6 +50,18 @@ def test_translucency_table__numbers_by_hand():
     )
     rms = np.sqrt(((0.05 * np.array([1.0, 1.2, 0.8])) ** 2).mean())
     assert float(table["sigma_tr_measurement_error"]) == pytest.approx(rms, rel=1e-6)
+
+
+def test_translucency_table__a_subject_counts_once_whatever_its_visits():
+    once = planted_tables(["S1", "S2", "S3"])
+    visits = once.isel(take=[0, 0, 1, 2, 2, 2]).assign_coords(
+        take=[f"{i}" for i in range(6)]
+    )
+    one, several = translucency_table(once), translucency_table(visits)
+    for name in ("sigma_tr_count", "sigma_tr_mean", "sigma_tr_standard_deviation"):
+        np.testing.assert_allclose(several[name], one[name], rtol=1e-12)
+    assert describe_visits(once) == ""
+    assert describe_visits(visits).startswith("6 takes of 3 subjects; ")
 
 
 def test_translucency_table__takes_without_errors_leave_the_measurement_error_unknown():

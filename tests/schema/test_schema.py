@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 
 import numpy as np
 import pytest
@@ -20,7 +21,10 @@ from skindb.schema import (
     names_of,
     variables,
 )
+from skindb.schema.cohort import take_name, visit_of
 from skindb.schema.declaration import DECLARED, declare
+from skindb.store import subject_of
+from skindb.store.place import TAKE
 
 DIMS = set(
     "surfel face light camera channel channel_2 site fibre dictionary parameter "
@@ -103,3 +107,25 @@ def test_status__each_member_explains_itself():
 @pytest.mark.parametrize("status", [FitStatus, ProbeStatus, TexelStatus])
 def test_status__codes_index_tables(status):
     assert [int(member) for member in status] == list(range(len(status)))
+
+
+@pytest.mark.parametrize(
+    ("parts", "name"),
+    [
+        (("3", "normal", 1, 1), "3"),
+        (("3", "lotion", 1, 1), "3.lotion"),
+        (("3", "normal", 2, 1), "3.normal.2"),
+        (("3", "lotion", 1, 12), "3.lotion.1.12"),
+        (("normal", "1", 1, 1), "normal.1"),
+        (("3", "2", 2, 1), "3.2.2"),
+    ],
+)
+def test_take_name__drops_what_is_first_or_normal(parts, name):
+    assert take_name(*parts) == name
+    assert re.fullmatch(TAKE, name)
+    assert (subject_of(name), *visit_of(name)) == (parts[0], *parts[2:])
+
+
+def test_take__other_names_are_refused():
+    for name in ("3.lotion.0", "3.lotion.02", "3.lotion.2.2.2", "3.lotion.b", "3..2"):
+        assert not re.fullmatch(TAKE, name)

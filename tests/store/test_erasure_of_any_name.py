@@ -79,7 +79,11 @@ class Planter:
         subjects = draw.sample(WORDS, draw.randint(2, 4))
         condition = draw.choice(WORDS)
         self.subjects = subjects
-        self.takes = [*subjects, f"{draw.choice(subjects)}.{condition}"]
+        self.takes = [*subjects]
+        self.takes += [
+            f"{draw.choice(subjects)}.{condition}{visit}"
+            for visit in ("", ".2", ".2.3")
+        ]
 
     def words(self, count: int) -> list[str]:
         """Words that may be pseudonyms."""

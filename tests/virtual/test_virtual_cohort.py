@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 from collections import Counter
 
+import numpy as np
 import pytest
 
 from skindb.errors import InputError
-from skindb.virtual.person import cohort_people
+from skindb.virtual.capture import session_time
+from skindb.virtual.person import VISIT_BLOOD, VISIT_MELANIN, cohort_people
 from skindb.workflow import simulate
 
 SIZE = {"cameras": 2, "lights": 12, "width": 24, "height": 30}
@@ -41,6 +43,25 @@ def test_cohort_people__the_first_are_the_same_whatever_the_number():
     assert cohort_people(5, seed=1) != cohort_people(5)
     twice = cohort_people(6, conditions=["lotion"])
     assert [one for one in twice if one.condition == "normal"] == cohort_people(6)
+
+
+def test_cohort_people__visits_vary_as_stated():
+    """Standard deviations from 2 x 800 degrees of freedom are known to 2 %; 5 standard
+    errors are allowed.
+    """
+    people = cohort_people(400, visits=3, conditions=["lotion"])
+    normal = [one for one in people if one.condition == "normal"]
+    first = normal[:3]
+    assert [one.take for one in first] == ["P001", "P001.normal.2", "P001.normal.3"]
+    assert len({session_time(one) for one in people if one.subject == "P001"}) == 6
+    of_day = {(one.subject, one.visit): one.melanin for one in normal}
+    for one in people:
+        if one.condition == "lotion" and (one.subject, one.visit) in of_day:
+            assert one.melanin == of_day[one.subject, one.visit]
+    for name, expected in (("melanin", VISIT_MELANIN), ("blood", VISIT_BLOOD)):
+        values = np.array([getattr(one, name) for one in normal]).reshape(-1, 3)
+        within = np.sqrt(values.var(axis=1, ddof=1).mean())
+        assert within == pytest.approx(expected, rel=0.13)
 
 
 @pytest.mark.slow

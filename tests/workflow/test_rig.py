@@ -319,16 +319,6 @@ def test_calibrate_rig__gains_that_are_not_common_are_not_stored(rig):
     assert not rig.db.has("calibration", "dome")
 
 
-def test_ingest__another_session_of_a_take_is_noted(rig):
-    same = ingest(rig, "S0")
-    assert "takes the place" not in str(same.provenance["skipped"])
-    file = rig.folder / "S0/capture.json"
-    record = json.loads(file.read_text()) | {"session": "2026-01-02T10:00:00+01:00"}
-    file.write_text(json.dumps(record))
-    line = f"takes the place of session {same.provenance['session']} as the newest"
-    assert line in str(ingest(rig, "S0").provenance["skipped"])
-
-
 def test_calibrate_rig__mistakes(rig, tmp_path):
     def refused(message: str, *takes: str, name: str = "dome") -> None:
         with pytest.raises(InputError, match=message):
