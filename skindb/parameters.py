@@ -103,6 +103,15 @@ def adjust_option() -> Any:
     return option((), text, metavar="NAME,...", show_default=False)
 
 
+def quantities_option() -> Any:
+    """Field of a record for the quantities of a study."""
+    text = (
+        "Quantities, separated by commas: R_d, surface reflectance, sigma_tr, L*, a*, b*, "
+        "ITA, melanin index, erythema index.  [default: the first three]"
+    )
+    return option((), text, metavar="NAME,...", show_default=False)
+
+
 def permutations_option(default: int = 10_000) -> Any:
     """Field of a record for the number of permutations."""
     text = "Largest number of permutations for p values."
@@ -120,6 +129,7 @@ class ContrastParameters:
 
     group_by: str = compared_option()
     adjust: tuple[str, ...] = adjust_option()
+    quantities: tuple[str, ...] = quantities_option()
     permutations: int = permutations_option()
     seed: int = seed_option("the permutations")
 

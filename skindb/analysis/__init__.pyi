@@ -65,6 +65,7 @@ from .surface import (
     describe_brdf_space,
     tabulate_brdf_space,
 )
+from .tidy import tidy
 from .traits import plot_traits, trait_vectors
 from .translucency import plot_translucency, translucency_table
 
@@ -128,6 +129,7 @@ __all__ = [
     "tabulate_registration",
     "tabulate_study",
     "take_masks",
+    "tidy",
     "trait_names",
     "trait_vectors",
     "transfer_detail",

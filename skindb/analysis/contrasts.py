@@ -51,6 +51,7 @@ def contrast_arguments(parameters: ContrastParameters) -> dict[str, Any]:
     return {
         "group_by": parameters.group_by,
         "adjust": parameters.adjust,
+        "quantities": parameters.quantities,
         "permutations": parameters.permutations,
         "rng": np.random.default_rng(parameters.seed),
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -62,6 +63,7 @@ def group_effects(
     *,
     group_by: str,
     adjust: Sequence[str] = (),
+    quantities: Sequence[str] = (),
     permutations: int = 10_000,
     rng: np.random.Generator,
 ) -> Dataset:
@@ -80,6 +82,8 @@ def group_effects(
         (age) is that of one unit. "condition" compares each condition with normal.
     adjust
         Attributes for which the regression adjusts. Subjects without them are excluded.
+    quantities
+        Names of quantities; default albedo, surface reflectance and sigma_tr.
     permutations
         Maximum number of permutations for p values; if there are fewer, all of them are used.
     rng
@@ -109,13 +113,14 @@ def group_effects(
     """
     require_comparable(cohort, "tables")
     adjust = (adjust,) if isinstance(adjust, str) else tuple(adjust)
+    measure = partial(quantities_of, names=tuple(quantities))
     compared, faults = compare_groups(
-        cohort, group_by, adjust, quantities_of, permutations=permutations, rng=rng
+        cohort, group_by, adjust, measure, permutations=permutations, rng=rng
     )
     if not compared:
         raise InputError(faults)
     statistics = [_statistics(comparison) for comparison in compared]
-    quantities = compared[0].contrast.quantities
+    measured = compared[0].contrast.quantities
     flags = [
         flag
         for comparison, values in zip(compared, statistics, strict=True)
@@ -129,7 +134,7 @@ def group_effects(
         },
         coords={
             "contrast": [comparison.contrast.name for comparison in compared],
-            "quantity": list(quantities.names),
+            "quantity": list(measured.names),
             "side": list(SIDES),
             "attribute": list(compared[0].associated),
         },
@@ -138,9 +143,7 @@ def group_effects(
             "adjust": list(adjust),
             "permutations": [comparison.test.permutations for comparison in compared],
             "smallest_p": [_smallest_p(comparison) for comparison in compared],
-            "logarithmic": list(
-                itertools.compress(quantities.names, quantities.is_log)
-            ),
+            "logarithmic": list(itertools.compress(measured.names, measured.is_log)),
             "flags": flags + notes_on_attributes(subjects_of(cohort)),
             "skipped": skipped_takes(cohort),
         },

@@ -9,11 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
-from xarray import DataArray, Dataset
+from xarray import Dataset
 
 from skindb.analysis.contrasts import Comparison, compare_groups, contrast_arguments
 from skindb.analysis.groups import SIGNIFICANT
-from skindb.analysis.quantities import QUANTITIES, SURFACE, Quantities, Quantity
+from skindb.analysis.quantities import (
+    SURFACE,
+    Quantities,
+    Quantity,
+    chosen_quantities,
+)
 from skindb.analysis.study import (
     Population,
     Results,
@@ -51,6 +56,7 @@ def effect_maps(
     *,
     group_by: str,
     adjust: Sequence[str] = (),
+    quantities: Sequence[str] = (),
     size: int = SIZE,
     permutations: int = PERMUTATIONS,
     min_fraction: float = MIN_FRACTION,
@@ -69,7 +75,7 @@ def effect_maps(
     ----------
     cohort
         ``db.cohort("maps")``.
-    group_by, adjust, rng
+    group_by, adjust, quantities, rng
         See `group_effects`.
     size
         Texels along each side; it must divide the size of the maps of the cohort.
@@ -102,7 +108,9 @@ def effect_maps(
         min_fraction=min_fraction,
         rng=rng,
     )
-    parts, flags, faults = _quantity_maps(cohort, size, compare)
+    parts, flags, faults = _quantity_maps(
+        cohort, chosen_quantities(quantities), size, compare
+    )
     if not parts:
         cure = "fit or register more takes"
         nothing = Fault("maps", "some texels must be measured", "none", cure)
@@ -125,6 +133,7 @@ def effect_maps(
 
 def _quantity_maps(
     cohort: Dataset,
+    chosen: Sequence[Quantity],
     size: int,
     compare: Callable[..., tuple[list[Comparison], list[Fault]]],
 ) -> tuple[list[Dataset], list[str], list[Fault]]:
@@ -132,7 +141,7 @@ def _quantity_maps(
     parts: list[Dataset] = []
     flags: list[str] = []
     faults: list[Fault] = []
-    for quantity in [quantity for quantity in QUANTITIES if quantity.mapped in cohort]:
+    for quantity in [quantity for quantity in chosen if quantity.mapped in cohort]:
         measure = partial(_texel_quantities, quantity=quantity, size=size)
         compared, undetermined = compare(measure)
         flags += [flag for comparison in compared for flag in comparison.flags]
@@ -140,7 +149,7 @@ def _quantity_maps(
         faults += [replace(f, where=f"{f.where}, {name}") for f in undetermined]
         if not compared:
             continue
-        maps = _arranged(compared, cohort[quantity.mapped], name, size)
+        maps = _arranged(compared, quantity, size)
         if parts and not maps["contrast"].equals(parts[0]["contrast"]):
             # a contrast is missing for this variable only
             rule = "every comparison must have texels"
@@ -150,15 +159,13 @@ def _quantity_maps(
     return parts, flags, faults
 
 
-def _arranged(
-    compared: Sequence[Comparison], values: DataArray, name: str, size: int
-) -> Dataset:
-    """Statistics (contrast, quantity, v, u) of comparisons of the texels of a variable,
-    of which each channel is a quantity.
+def _arranged(compared: Sequence[Comparison], quantity: Quantity, size: int) -> Dataset:
+    """Statistics (contrast, quantity, v, u) of comparisons of the texels of a quantity,
+    of which each channel counts as one.
     """
-    titles = (
-        [f"{name} {channel}" for channel in CHANNELS] if values.ndim == 4 else [name]
-    )
+    titles = [quantity.name]
+    if "channel" in quantity.dims:
+        titles = [f"{quantity.name} {channel}" for channel in CHANNELS]
     statistics: dict[str, list[Array]] = {}
     for comparison in compared:
         test = comparison.test
@@ -206,7 +213,9 @@ def _block_means(take: Dataset, quantity: Quantity, size: int) -> Array:
     where too few were measured.
     """
     values = take[quantity.mapped].values.astype(float)
-    values = quantity.compared(values.reshape(*values.shape[:2], -1))
+    size_of_maps = values.shape[:2]
+    values = quantity.compared(values.reshape(*size_of_maps, -1))
+    values = values.reshape(*size_of_maps, -1)
     is_known = finite_rows(values)
     weight = np.where(is_known, take[variables.TEXEL_COVERAGE].values, 0.0)[..., None]
     block = len(values) // size

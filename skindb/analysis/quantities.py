@@ -3,20 +3,32 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from xarray import DataArray, Dataset
 
-from skindb.analysis.subjects import level_error
-from skindb.errors import require
+from skindb.analysis.colour import (
+    cielab,
+    erythema_index,
+    melanin_index,
+    propagated,
+    typology_angle,
+)
+from skindb.analysis.subjects import LEVEL, level_error
+from skindb.errors import Fault, InputError, require
 from skindb.numerics.statistics import known_mean
-from skindb.schema import IDENTIFIED, variables
+from skindb.schema import IDENTIFIED, ProbeStatus, variables
 from skindb.schema.label import CHANNELS
-from skindb.types import Array, Index, float64
+from skindb.types import AnyArray, Array, Index, float64
 
 NORMAL_95 = 1.96
+SURFACE = "surface reflectance"
+TYPOLOGY_ANGLE = "ITA"
+COLOUR_DIFFERENCE = "delta E"
 
 
 @dataclass(frozen=True)
@@ -27,41 +39,95 @@ class Quantity:
     tabulated: str
     mapped: str
     dims: tuple[str, ...]  # of the table, after the take
+    error: str  # variable of the table, without what all takes have in common
+    total_error: str  # variable of the table
+    unit: str = "1"
     is_log: bool = (
         False  # whether logarithms are compared, so that intervals stay positive
     )
     has_common_error: bool = (
         False  # whether all takes have the error of the level in common
     )
+    # function of R_d (..., channel), for quantities that are derived from it
+    derive: Callable[[Array], Array] | None = None
 
     def compared(self, values: Array) -> Array:
-        """The values as they are compared; logarithms of positive ones."""
-        return np.log(np.where(values > 0, values, np.nan)) if self.is_log else values
+        """The variable's values (..., channel) as they are compared: derived, or
+        logarithms of positive ones.
+        """
+        if self.derive is not None:
+            return self.derive(values)
+        if self.is_log:
+            values = np.log(np.where(values > 0, values, np.nan))
+        return values
 
 
-SURFACE = "surface reflectance"
-QUANTITIES = (
-    Quantity(
-        "R_d",
-        variables.REGION_DIFFUSE_REFLECTANCE,
-        variables.TEXEL_DIFFUSE_REFLECTANCE,
-        ("region", "channel"),
-        has_common_error=True,
-    ),
+REFLECTANCE = Quantity(
+    "R_d",
+    variables.REGION_DIFFUSE_REFLECTANCE,
+    variables.TEXEL_DIFFUSE_REFLECTANCE,
+    ("region", "channel"),
+    variables.REGION_DIFFUSE_REFLECTANCE_ERROR,
+    variables.REGION_DIFFUSE_REFLECTANCE_TOTAL_ERROR,
+    has_common_error=True,
+)
+MEASURED = (
+    REFLECTANCE,
     Quantity(
         SURFACE,
         variables.REGION_SURFACE_REFLECTANCE,
         variables.TEXEL_SURFACE_REFLECTANCE,
         ("region",),
+        variables.REGION_SURFACE_REFLECTANCE_ERROR,
+        variables.REGION_SURFACE_REFLECTANCE_ERROR,
     ),
     Quantity(
         "sigma_tr",
         variables.SITE_SIGMA_TR,
         variables.TEXEL_SIGMA_TR,
         ("site", "channel"),
+        variables.SITE_SIGMA_TR_ERROR,
+        variables.SITE_SIGMA_TR_TOTAL_ERROR,
+        unit="mm-1",
         is_log=True,
     ),
 )
+
+
+def _of_lab(index: int, reflectance: Array) -> Array:
+    return cielab(reflectance)[..., index]
+
+
+DERIVED: dict[str, tuple[str, Callable[[Array], Array]]] = {
+    "L*": ("1", partial(_of_lab, 0)),
+    "a*": ("1", partial(_of_lab, 1)),
+    "b*": ("1", partial(_of_lab, 2)),
+    TYPOLOGY_ANGLE: ("degree", typology_angle),
+    "melanin index": ("1", melanin_index),
+    "erythema index": ("1", erythema_index),
+}
+QUANTITIES = {
+    quantity.name: quantity
+    for quantity in (
+        *MEASURED,
+        *(
+            replace(REFLECTANCE, name=name, dims=("region",), unit=unit, derive=derive)
+            for name, (unit, derive) in DERIVED.items()
+        ),
+    )
+}
+DEFAULT = tuple(quantity.name for quantity in MEASURED)  # quantities of comparisons
+
+
+class Measurement(NamedTuple):
+    """A quantity of the takes of a cohort."""
+
+    quantity: Quantity
+    labels: list[list[str]]  # of each dim after the take
+    values: Array  # (take, ...) NaN where there is no value, or none to be trusted
+    errors: Array  # (take, ...) standard errors, without `common`
+    common: Array  # (take, ...) standard errors that the takes have in common
+    status: AnyArray  # (take, ...) words
 
 
 @dataclass(frozen=True)
@@ -74,6 +140,8 @@ class Quantities:
     is_log: tuple[bool, ...] = ()  # (q,)
     # (q,) half-width of the 95 % interval of an error that all takes have in common
     common: tuple[float, ...] = ()
+    # (n, q) standard errors of the values, without what all takes have in common
+    errors: Array | None = None
 
     def of_subjects(self, names: Iterable[str] = ()) -> Quantities:
         """Means over the takes of every subject, by default of all."""
@@ -82,12 +150,22 @@ class Quantities:
             np.array([name == subject for subject in self.subject]) for name in names
         ]
         values = np.stack([known_mean(self.values[rows]) for rows in takes])
-        return replace(self, values=values, subject=names)
+        errors = None
+        if self.errors is not None:
+            errors = np.stack([_mean_error(self.errors[rows]) for rows in takes])
+        return replace(self, values=values, subject=names, errors=errors)
 
     def select(self, rows: Sequence[int] | Index) -> Quantities:
         """The quantities of the takes or subjects with these indices."""
         subject = tuple(self.subject[i] for i in rows)
-        return replace(self, values=self.values[rows], subject=subject)
+        errors = None if self.errors is None else self.errors[rows]
+        return replace(self, values=self.values[rows], subject=subject, errors=errors)
+
+
+def _mean_error(errors: Array) -> Array:
+    """Standard error of the mean of values with independent errors (n, ...)."""
+    count = np.isfinite(errors).sum(axis=0)
+    return np.asarray(np.sqrt(known_mean(errors**2) / np.maximum(count, 1)))
 
 
 def trusted(takes: Dataset, variable: str) -> DataArray:
@@ -95,48 +173,145 @@ def trusted(takes: Dataset, variable: str) -> DataArray:
     return takes[variable].where(takes[variables.SITE_STATUS].isin(IDENTIFIED))
 
 
-def quantities_of(cohort: Dataset) -> Quantities:
-    """Albedo and surface reflectance of regions and log sigma_tr of probe sites, for every take.
+def chosen_quantities(names: Sequence[str]) -> tuple[Quantity, ...]:
+    """The quantities of these names, by default the measured ones.
+
+    Raises
+    ------
+    InputError
+        For an unknown name.
+    """
+    if unknown := [name for name in names if name not in QUANTITIES]:
+        cure = f"choose from: {', '.join(QUANTITIES)}"
+        rule = "must be known"
+        raise InputError(
+            Fault(f"quantity {name}", rule, "another name", cure) for name in unknown
+        )
+    return tuple(QUANTITIES[name] for name in names or DEFAULT)
+
+
+def measurements(
+    cohort: Dataset, names: Sequence[str] = tuple(QUANTITIES)
+) -> list[Measurement]:
+    """The quantities that a cohort has, with their errors.
+
+    Errors of derived quantities are propagated to first order from those of R_d, which
+    are independent between channels, and from the error of its level, which they share.
 
     Parameters
     ----------
     cohort
         ``db.cohort("tables")``.
+    names
+        Of the quantities.
+    """
+    prefixes = ("region_", "site_")
+    tables = cohort[[name for name in cohort if str(name).startswith(prefixes)]].load()
+    level = np.zeros(cohort.sizes["take"])
+    if LEVEL in cohort.coords:
+        level = np.nan_to_num(cohort[LEVEL].values.astype(float))
+    quantities = chosen_quantities(names)
+    return [_measured(tables, q, level) for q in quantities if q.tabulated in tables]
+
+
+def _measured(tables: Dataset, quantity: Quantity, level: Array) -> Measurement:
+    """A quantity of the takes whose levels have the errors `level` (take,)."""
+    is_site = "site" in quantity.dims
+    dims = ["take", *quantity.dims]
+    if quantity.derive is not None:
+        dims.append("channel")
+    select = trusted if is_site else Dataset.__getitem__
+    values: Array = float64(select(tables, quantity.tabulated).transpose(*dims).values)
+    error: Array
+    error, total = (
+        float64(tables[name].transpose(*dims).values)
+        if name in tables
+        else np.full_like(values, np.nan)
+        for name in (quantity.error, quantity.total_error)
+    )
+    common: Array = np.sqrt(np.maximum(total**2 - error**2, 0))
+    if quantity.has_common_error:
+        common = np.broadcast_to(
+            level.reshape(-1, *[1] * (values.ndim - 1)), values.shape
+        )
+        # the level is a part of the total error, whose rest differs between takes
+        rest = np.sqrt(np.maximum(total**2 - common**2, error**2))
+        error = np.where(np.isfinite(total), rest, error)
+    if quantity.derive is not None:
+        reflectance = values
+        values = quantity.derive(reflectance)
+        error, common = propagated(quantity.derive, reflectance, error, common[..., 0])
+    status = np.where(np.isfinite(values), "fitted", "missing")
+    if is_site:
+        words = {int(one): one.name.lower() for one in ProbeStatus}
+        codes = tables[variables.SITE_STATUS].transpose(*dims).values
+        status = np.vectorize(words.get, otypes=[object])(codes)
+    labels = [
+        list(CHANNELS) if dim == "channel" else tables[dim].values.tolist()
+        for dim in quantity.dims
+    ]
+    return Measurement(quantity, labels, values, error, common, status)
+
+
+def quantities_of(cohort: Dataset, names: Sequence[str] = ()) -> Quantities:
+    """Quantities of regions and probe sites as they are compared, for every take.
+
+    Parameters
+    ----------
+    cohort
+        ``db.cohort("tables")``.
+    names
+        Of the quantities; default albedo, surface reflectance and sigma_tr.
 
     Raises
     ------
     InputError
-        If no take has any of these quantities.
+        If a name is unknown, or no take has any of these quantities.
     """
-    prefixes = ("region_", "site_")
-    tables = cohort[[name for name in cohort if str(name).startswith(prefixes)]].load()
     half_width = NORMAL_95 * float(np.nan_to_num(level_error(cohort)))
     columns: list[Array] = []
+    errors: list[Array] = []
     described: list[tuple[str, bool, float]] = []
-    for quantity in QUANTITIES:
-        if quantity.tabulated not in tables:
-            continue
-        is_site = "site" in quantity.dims
-        select = trusted if is_site else Dataset.__getitem__
-        table = select(tables, quantity.tabulated).transpose("take", *quantity.dims)
-        values = quantity.compared(float64(table.values)).reshape(len(table), -1)
-        labels = [
-            CHANNELS if dim == "channel" else tables[dim].values
-            for dim in quantity.dims
-        ]
-        common = half_width if quantity.has_common_error else 0.0
-        for words, column in zip(itertools.product(*labels), values.T, strict=True):
+    for measured in measurements(cohort, names or DEFAULT):
+        quantity = measured.quantity
+        count = len(measured.values)
+        values = measured.values
+        error = measured.errors
+        if quantity.is_log:
+            error = error / values
+            values = quantity.compared(values)
+        common = np.nan_to_num(measured.common).reshape(count, -1)
+        half_widths = (
+            NORMAL_95 * common.max(axis=0, initial=0.0)
+            if quantity.derive is not None
+            else np.full(common.shape[1], half_width * quantity.has_common_error)
+        )
+        for words, column, deviation, width in zip(
+            itertools.product(*measured.labels),
+            values.reshape(count, -1).T,
+            error.reshape(count, -1).T,
+            half_widths,
+            strict=True,
+        ):
             if np.isfinite(column).any():
                 columns.append(column)
+                errors.append(deviation)
                 name = " ".join([quantity.name, *map(str, words)])
-                described.append((name, quantity.is_log, common))
+                described.append((name, quantity.is_log, float(width)))
     require(
         columns,
         "population",
-        "some take must have albedo, surface reflectance or sigma_tr",
+        f"some take must have {' or '.join(names or DEFAULT)}",
         "none of them",
         "fit the takes again",
     )
     subject = tuple(map(str, cohort["subject"].values))
-    names, is_log, commons = zip(*described, strict=True)
-    return Quantities(np.stack(columns, axis=1), subject, names, is_log, commons)
+    labels, is_log, commons = zip(*described, strict=True)
+    return Quantities(
+        np.stack(columns, axis=1),
+        subject,
+        labels,
+        is_log,
+        commons,
+        np.stack(errors, axis=1),
+    )

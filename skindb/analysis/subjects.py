@@ -32,6 +32,8 @@ UNKNOWN = "unknown"
 OTHER = "other conditions"
 # coordinates along "take" that describe no subject
 NO_ATTRIBUTES = ("take", "subject", "visit", "repeat", "session", "model_generation")
+# coordinate of the error of R_d that all channels of a take share
+LEVEL = "fit_even_reflection_error"
 FIT = "fit_"  # prefix of coordinates that are parameters of the fit
 
 
@@ -271,9 +273,9 @@ def level_error(takes: Dataset) -> float:
     """Largest standard error of R_d that the takes have in common by the prior of their
     surface's reflection; NaN if no take states one.
     """
-    if "fit_even_reflection_error" not in takes.coords:
+    if LEVEL not in takes.coords:
         return math.nan
-    errors = takes["fit_even_reflection_error"].values.astype(float)
+    errors = takes[LEVEL].values.astype(float)
     return float(np.nanmax(errors)) if np.isfinite(errors).any() else math.nan
 
 

@@ -19,7 +19,7 @@ from skindb.cli.laboratory import calibrate, capture, landmarks
 from skindb.cli.pictures import compare, export, render, show, view
 from skindb.cli.population import edit, register
 from skindb.cli.shared import echo_json, fault_lines
-from skindb.cli.studies import analyze
+from skindb.cli.studies import analyze, tidy
 from skindb.cli.subjects import consent, refresh, release, withdraw
 from skindb.cli.terminal import echo
 from skindb.cli.upkeep import audit, backup, bench, clean, info, restore, verify
@@ -51,6 +51,7 @@ for _command in (
     fit,
     dictionary_command,
     analyze,
+    tidy,
     register,
     edit,
     render,

@@ -1,4 +1,4 @@
-"""The command analyze, with one command for each study.
+"""The command analyze, with one command for each study, and tidy.
 
 The names, descriptions and parameters of the studies are read from their source: the help
 is shown, and wrong options are refused, without importing the science that the studies
@@ -20,9 +20,10 @@ import click
 
 import skindb
 from skindb import parameters as parameter_module
-from skindb.cli.options import DB, PATH, SCHEDULER, common, options_of
+from skindb.cli.options import DB, PATH, SCHEDULER, command, common, options_of
 from skindb.cli.shared import aligned, cluster, emit, existing, shared_path, writable
 from skindb.cli.terminal import bar
+from skindb.errors import input_error
 from skindb.files import csv_text, private_file
 
 if TYPE_CHECKING:
@@ -194,10 +195,10 @@ def _study_command(study: Declaration) -> click.Command:
         (TAKES, options_of(study.parameters), *STORED, SCHEDULER, common)
     ):
         run = add(run)
-    command = click.command(study.name, help=f"Study the {study.description}.")(run)
+    studying = click.command(study.name, help=f"Study the {study.description}.")(run)
     if study.name == "translucency":
-        command.params += FACES
-    return command
+        studying.params += FACES
+    return studying
 
 
 def _run_study(
@@ -218,9 +219,9 @@ def _run_study(
     if csv:
         writable(csv, ".csv")
     chosen = dict(vars(parameters))
-    if "adjust" in chosen:
-        names = ",".join(chosen["adjust"]).split(",")
-        chosen["adjust"] = tuple(name.strip() for name in names if name.strip())
+    for several in {"adjust", "quantities"}.intersection(chosen):
+        names = ",".join(chosen[several]).split(",")
+        chosen[several] = tuple(name.strip() for name in names if name.strip())
     if "dictionary" in chosen:
         chosen["dictionary"] = shared_path(chosen["dictionary"])
     database = existing(click.get_current_context().obj)
@@ -298,3 +299,35 @@ def _unit_lines(units: dict[str, str], columns: list[str]) -> list[str]:
         if units.get(name, "1") not in ("", "1"):
             names_by_unit.setdefault(units[name], []).append(name)
     return [f"unit {unit}: {', '.join(names)}" for unit, names in names_by_unit.items()]
+
+
+@command
+@DB
+@TAKES
+@click.option("--release", help="Name of a release.  [default: the newest versions]")
+@click.option(
+    "--out", type=PATH, required=True, help="Table to write (.csv or .parquet)."
+)
+def tidy(db: str, takes: tuple[str, ...], release: str | None, out: Path) -> None:
+    """Write a table with one row for each take, region, channel and quantity.
+
+    Its columns are the value, its standard error, unit and status, the subject,
+    condition, visit and repeat, and the attributes of the captures.
+    """
+    writable(out, ".csv", ".parquet")
+    table, skipped = skindb.workflow.tidy_table(
+        existing(db), takes=takes, release=release
+    )
+    file = private_file(out)
+    if out.suffix == ".csv":
+        file.write_text(csv_text([*table], table.values.tolist()), encoding="utf-8")
+    else:
+        try:
+            table.to_parquet(file)
+        except ImportError:
+            raise input_error(
+                str(out), "needs pyarrow", "none", "pip install pyarrow, or write .csv"
+            ) from None
+    lines = [f"skipped: {line}" for line in skindb.schema.note_lines(skipped)]
+    report = {"path": str(out), "rows": len(table), "skipped": skipped}
+    emit(report, [f"{out}: {len(table)} rows", *lines])

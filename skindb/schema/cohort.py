@@ -52,7 +52,7 @@ def take_name(
     subject: str, condition: str = NORMAL, visit: int = 1, repeat: int = 1
 ) -> str:
     """`<subject>[.<condition>[.<visit>[.<repeat>]]]`; at the end, the condition normal,
-    the first visit and the first repeat are left out.
+    the first visit and the first repeat are omitted.
     """
     parts = [subject, condition, visit, repeat]
     while parts[-1] == (None, NORMAL, 1, 1)[len(parts) - 1]:

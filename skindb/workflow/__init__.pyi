@@ -53,7 +53,7 @@ from .quicklook import quick
 from .rig import calibrate_rig, describe_rig
 from .session import capture_session, plan_session
 from .simulation import begin_cohort, simulate, simulate_one
-from .studies import STUDY_FUNCTIONS, study
+from .studies import STUDY_FUNCTIONS, study, tidy_table
 from .takes import (
     Outcome,
     computing_on,
@@ -127,6 +127,7 @@ __all__ = [
     "superseded_lines",
     "takes_to_fit",
     "takes_without_consent",
+    "tidy_table",
     "translucency_grid",
     "view_server",
     "view_takes",

@@ -13,6 +13,7 @@ from functools import partial, wraps
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import xarray as xr
 from dask.delayed import Delayed, delayed
 
@@ -26,6 +27,7 @@ from skindb.analysis.subjects import (
     subjects_of,
     subjects_without_normal,
 )
+from skindb.analysis.tidy import tidy
 from skindb.errors import InputError, input_error, require
 from skindb.format.dome import EXPOSURE_RATIO
 from skindb.parameters import option_of, require_limits
@@ -353,6 +355,27 @@ def study(
                 version.attrs["registration"] = population.notes
             derivation.commit(version)
     return db.read(STUDY, key)
+
+
+def tidy_table(
+    db: Database, *, takes: Sequence[str] = (), release: str | None = None
+) -> tuple[pd.DataFrame, list[Note]]:
+    """The table `skindb.analysis.tidy` of the takes of a database, and one note for each
+    skipped take.
+
+    Parameters
+    ----------
+    db
+        Database with models.
+    takes
+        Default all whose consent covers statistics.
+    release
+        Name of a release; default the newest versions.
+    """
+    with logged_action(db, "tidy", takes or db.takes("model", release=release)):
+        _require_models(db, takes, release)
+        cohort = db.cohort("tables", takes=takes or None, release=release)
+        return tidy(cohort), cohort.attrs["skipped"]
 
 
 def study_key(record: Study, requested: Mapping[str, Any], name: str | None) -> str:

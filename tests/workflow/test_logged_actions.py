@@ -32,6 +32,7 @@ LOG_THEMSELVES = {
     "ingest_take",
     "record_consent",
     "study",
+    "tidy_table",
     "withdraw",
 }
 # functions that compute or list what a command needs, and neither change nor disclose
@@ -40,6 +41,7 @@ NOT_LOGGED = {
     "describe_calibration",
     "describe_rig",
     "kept_parameters",
+    "next_visits",
     "parameters_of",
     "plan_withdrawal",
     "registered_datasets",

@@ -1,0 +1,150 @@
+"""A cohort as a table with one row for each value, for pandas, seaborn, statsmodels and R."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+from xarray import Dataset
+
+from skindb.analysis.colour import colour_difference, propagated, typology_class
+from skindb.analysis.quantities import (
+    COLOUR_DIFFERENCE,
+    REFLECTANCE,
+    TYPOLOGY_ANGLE,
+    Measurement,
+    measurements,
+)
+from skindb.analysis.subjects import CONDITION, NORMAL, subjects_of
+from skindb.schema.cohort import require_takes, visit_of
+from skindb.types import Array
+
+KEYS = ("take", "subject", CONDITION, "visit", "repeat")
+COLUMNS = (
+    "quantity",
+    "region",
+    "channel",
+    "value",
+    "error",
+    "common_error",
+    "unit",
+    "status",
+    "label",
+)
+
+
+def tidy(cohort: Dataset) -> pd.DataFrame:
+    """One row for each take, region or probe site, channel and quantity.
+
+    Parameters
+    ----------
+    cohort
+        ``db.cohort("tables")``.
+
+    Returns
+    -------
+    DataFrame
+        Columns take, subject, condition, visit and repeat; quantity; region, also for
+        sites of the probe; channel (R, G, B, or missing); value, NaN where there is
+        none to be trusted, in `unit`; `error`, its standard error without
+        `common_error`, which all takes have in common; status; label (the class of an
+        individual typology angle); and each attribute of the captures, as
+        ``attribute_<name>`` if it has the name of another column.
+
+        Quantities: R_d, surface reflectance and sigma_tr; CIELAB L*, a*, b*, individual
+        typology angle (ITA), melanin index and erythema index of R_d, see
+        `skindb.analysis.colour`; and delta E, the CIEDE2000 difference to the first
+        take of the subject in the condition normal, which noise makes larger.
+
+    Raises
+    ------
+    InputError
+        If the cohort has another layout.
+
+    Examples
+    --------
+    >>> frame = tidy(db.cohort("tables"))  # doctest: +SKIP
+    >>> cheek = frame[(frame.quantity == "ITA") & (frame.region == "cheek")]  # doctest: +SKIP
+    """
+    require_takes(cohort, "tables")
+    subjects = subjects_of(cohort)
+    attributes = {
+        f"attribute_{name}" if name in (*KEYS, *COLUMNS) else name: attribute.values
+        for name, attribute in subjects.attributes.items()
+        if name != CONDITION
+    }
+    visit, repeat = zip(*map(visit_of, subjects.take), strict=True)
+    conditions = subjects.attribute(CONDITION).values
+    keys = (subjects.take, subjects.subject, conditions, visit, repeat)
+    takes = pd.DataFrame(dict(zip(KEYS, keys, strict=True)) | attributes)
+    measured = measurements(cohort)
+    rows = [_rows(one) for one in [*measured, *_differences(measured, takes)]]
+    table = takes.merge(pd.concat(rows), left_index=True, right_index=True)
+    return table[[*KEYS, *COLUMNS, *attributes]].reset_index(drop=True)
+
+
+def _rows(measured: Measurement) -> pd.DataFrame:
+    """Rows of a quantity, whose index is the number of the take."""
+    quantity = measured.quantity
+    labels = [*itertools.product(*measured.labels)]
+    count = len(measured.values)
+    values = measured.values.ravel()
+    is_angle = quantity.name == TYPOLOGY_ANGLE
+    columns = (
+        quantity.name,
+        [label[0] for label in labels] * count,
+        [label[1] if len(label) > 1 else None for label in labels] * count,
+        values,
+        measured.errors.ravel(),
+        np.nan_to_num(measured.common.ravel()),
+        quantity.unit,
+        measured.status.ravel(),
+        [typology_class(value) if is_angle else "" for value in values.tolist()],
+    )
+    index = np.repeat(np.arange(count), len(labels))
+    return pd.DataFrame(dict(zip(COLUMNS, columns, strict=True)), index)
+
+
+def _differences(
+    measured: list[Measurement], takes: pd.DataFrame
+) -> Iterator[Measurement]:
+    """Differences of colour to the first take of each subject in the condition normal."""
+    reflectance = next((one for one in measured if one.quantity == REFLECTANCE), None)
+    if reflectance is None:
+        return
+    normal = takes[takes[CONDITION] == NORMAL].sort_values(["visit", "repeat"])
+    first = dict(zip(normal["subject"][::-1], normal.index[::-1], strict=True))
+    baseline = np.array([first.get(subject, -1) for subject in takes["subject"]])
+    is_compared = (baseline >= 0) & (baseline != takes.index)
+    before = reflectance.values[baseline]
+
+    def change(now: Array) -> Array:
+        return colour_difference(now, before)
+
+    def change_of_baseline(then: Array) -> Array:
+        return colour_difference(reflectance.values, then)
+
+    nothing = np.zeros(before.shape[:-1])
+    values = change(reflectance.values)
+    errors = np.hypot(
+        propagated(change, reflectance.values, reflectance.errors, nothing)[0],
+        propagated(change_of_baseline, before, reflectance.errors[baseline], nothing)[
+            0
+        ],
+    )
+    values[~is_compared] = np.nan
+    errors[~is_compared] = np.nan
+    absent = np.where(is_compared, "missing", "no baseline")[:, None]
+    absent = np.where((baseline == takes.index)[:, None], "baseline", absent)
+    words = np.where(np.isfinite(values), "fitted", absent)
+    yield Measurement(
+        replace(REFLECTANCE, name=COLOUR_DIFFERENCE, dims=("region",)),
+        reflectance.labels[:1],
+        values,
+        errors,
+        nothing,
+        words,
+    )
