@@ -51,6 +51,11 @@ from .registration import (
     register,
     tabulate_registration,
 )
+from .repeatability import (
+    describe_repeatability,
+    plot_repeatability,
+    repeatability,
+)
 from .studies import STUDIES, describe_study, plot_study, tabulate_study
 from .subjects import groups_by, sides, subjects_of, trait_names
 from .summary import (
@@ -94,6 +99,7 @@ __all__ = [
     "describe_edit",
     "describe_effect_maps",
     "describe_group_effects",
+    "describe_repeatability",
     "describe_study",
     "doubtful_landmarks",
     "effect_maps",
@@ -111,6 +117,7 @@ __all__ = [
     "plot_group_effects",
     "plot_group_lobes",
     "plot_group_spheres",
+    "plot_repeatability",
     "plot_study",
     "plot_traits",
     "plot_translucency",
@@ -119,6 +126,7 @@ __all__ = [
     "region_masks",
     "region_tables",
     "register",
+    "repeatability",
     "sample_surfels",
     "sides",
     "subjects_of",

@@ -12,6 +12,7 @@ from skindb.analysis.correlations import STUDY as CORRELATIONS
 from skindb.analysis.coverage import STUDY as COVERAGE
 from skindb.analysis.groups import STUDY as GROUPS
 from skindb.analysis.maps import STUDY as MAPS
+from skindb.analysis.repeatability import STUDY as REPEATABILITY
 from skindb.analysis.study import Study, Table
 from skindb.analysis.surface import STUDY as SURFACE
 from skindb.analysis.traits import STUDY as TRAITS
@@ -33,6 +34,7 @@ STUDIES: dict[str, Study] = {
         CHROMOPHORES,
         COVERAGE,
         SURFACE,
+        REPEATABILITY,
     )
 }
 

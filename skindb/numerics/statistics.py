@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import optimize, stats
@@ -132,6 +132,65 @@ def detectable_difference(error: Array, free: Array | float) -> Array:
     """
     quantiles = stats.t.ppf((1 + CONFIDENCE) / 2, free) + stats.t.ppf(POWER, free)
     return error * quantiles
+
+
+class OneWay(NamedTuple):
+    """Intraclass correlation of a one-way design with its 95 % interval, and the
+    standard deviation within subjects.
+    """
+
+    correlation: float
+    low: float
+    high: float
+    within: float
+
+
+def intraclass_correlation(values: Array, subject: AnyArray) -> OneWay:
+    """ICC(1) of values (n,) of subjects (n,), at least two of them and one with two
+    values; exact for equal numbers of values (Shrout and Fleiss 1979), and with their
+    mean number otherwise.
+    """
+    _, member, count = np.unique(subject, return_inverse=True, return_counts=True)
+    n, people = len(values), len(count)
+    mean = np.bincount(member, values) / count
+    between = float(count @ (mean - values.mean()) ** 2) / (people - 1)
+    within = float(((values - mean[member]) ** 2).sum()) / (n - people)
+    size = (n - float(count @ count) / n) / (people - 1)
+    upper = stats.f.ppf((1 + CONFIDENCE) / 2, people - 1, n - people)
+    lower = stats.f.ppf((1 + CONFIDENCE) / 2, n - people, people - 1)
+    # ratios of the mean squares between and within subjects, times the latter
+    squares = (between, between / upper, between * lower)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        bounds = [np.divide(b - within, b + (size - 1) * within) for b in squares]
+    return OneWay(*map(float, (*bounds, np.sqrt(within))))
+
+
+def agreement_correlation(values: Array) -> tuple[float, float, float]:
+    """ICC(2,1) of values (subject, occasion) with its 95 % interval (McGraw and Wong
+    1996, ICC(A,1)); NaN for fewer than three subjects or two occasions.
+    """
+    n, k = values.shape
+    if n < 3 or k < 2:
+        return np.nan, np.nan, np.nan
+    people, occasions = values.mean(axis=1), values.mean(axis=0)
+    rest = values - people[:, None] - occasions + values.mean()
+    between = k * people.var(ddof=1)
+    occasion = n * occasions.var(ddof=1)
+    error = (rest**2).sum() / ((n - 1) * (k - 1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        spread = between + (k - 1) * error
+        icc = (between - error) / (spread + k * (occasion - error) / n)
+        a = k * icc / (n * (1 - icc))
+        b = 1 + k * icc * (n - 1) / (n * (1 - icc))
+        free = (a * occasion + b * error) ** 2 / (
+            (a * occasion) ** 2 / (k - 1) + (b * error) ** 2 / ((n - 1) * (k - 1))
+        )
+        upper = stats.f.ppf((1 + CONFIDENCE) / 2, n - 1, free)
+        lower = stats.f.ppf((1 + CONFIDENCE) / 2, free, n - 1)
+        others = k * occasion + (k * n - k - n) * error
+        low = n * (between - upper * error) / (upper * others + n * between)
+        high = n * (lower * between - error) / (others + n * lower * between)
+    return float(icc), float(low), float(high)
 
 
 def variance_components(values: Array, subject: AnyArray) -> tuple[float, float, float]:

@@ -365,6 +365,72 @@ CORRELATION_COUNT = declare(
     "subjects with both components",
 )
 
+# repeatability
+REPEAT_SUBJECTS = declare(
+    "int32 repeatability/repeat_subjects(quantity) [1]",
+    "subjects with two values or more",
+)
+REPEAT_TAKES = declare(
+    "int32 repeatability/repeat_takes(quantity) [1]",
+    "takes with a value",
+)
+ICC = declare(
+    "float64 repeatability/icc(quantity) [1]",
+    "ICC(1): fraction of the variance that is between subjects",
+    "Shrout and Fleiss 1979",
+)
+ICC_LOW = declare(
+    "float64 repeatability/icc_low(quantity) [1]",
+    "lower end of the 95 % interval of icc",
+)
+ICC_HIGH = declare(
+    "float64 repeatability/icc_high(quantity) [1]",
+    "upper end of the 95 % interval of icc",
+)
+ICC_AGREEMENT = declare(
+    "float64 repeatability/icc_agreement(quantity) [1]",
+    "ICC(2,1): icc of subjects with all visits and repeats, absolute agreement",
+    "McGraw and Wong 1996",
+)
+ICC_AGREEMENT_LOW = declare(
+    "float64 repeatability/icc_agreement_low(quantity) [1]",
+    "lower end of the 95 % interval of icc_agreement",
+)
+ICC_AGREEMENT_HIGH = declare(
+    "float64 repeatability/icc_agreement_high(quantity) [1]",
+    "upper end of the 95 % interval of icc_agreement",
+)
+WITHIN_SUBJECT_DEVIATION = declare(
+    "float64 repeatability/within_subject_deviation(quantity) [1]",
+    "standard deviation between takes of one subject",
+)
+REPEATABILITY_COEFFICIENT = declare(
+    "float64 repeatability/repeatability_coefficient(quantity) [1]",
+    "difference that two takes of one subject exceed in 5 % of cases: the smallest "
+    "detectable change",
+    "Bland and Altman 1986",
+)
+DETECTABLE_CHANGE_OF_MEAN = declare(
+    "float64 repeatability/detectable_change_of_mean(quantity) [1]",
+    "smallest detectable change of the mean over the subjects with two values",
+    "de Vet et al. 2006",
+)
+REPEAT_BIAS = declare(
+    "float64 repeatability/repeat_bias(quantity) [1]",
+    "mean over subjects of the second take less the first",
+)
+AGREEMENT_LOW = declare(
+    "float64 repeatability/agreement_low(quantity) [1]",
+    "lower limit of agreement of the second take less the first",
+    "Bland and Altman 1986",
+)
+AGREEMENT_HIGH = declare(
+    "float64 repeatability/agreement_high(quantity) [1]",
+    "upper limit of agreement of the second take less the first",
+    "Bland and Altman 1986",
+)
+
+
 # effect_maps
 MAP_EFFECT = declare(
     "float32 effect_maps/map_effect(contrast, quantity, v, u) [1]",

@@ -1,0 +1,225 @@
+"""Repeatability of quantities: what differs between takes of one subject in one condition."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from xarray import Dataset
+
+from skindb import plots
+from skindb.analysis.quantities import NORMAL_95, Quantities, quantities_of
+from skindb.analysis.study import (
+    Population,
+    Results,
+    Study,
+    Table,
+    skipped_takes,
+    table_of,
+)
+from skindb.analysis.subjects import CONDITION, NORMAL, subjects_of
+from skindb.errors import require
+from skindb.numerics.statistics import agreement_correlation, intraclass_correlation
+from skindb.parameters import option, quantities_option
+from skindb.schema import dataset, variables
+from skindb.schema.cohort import require_comparable, visit_of
+from skindb.types import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+MIN_SUBJECTS = 3  # with a repeated value
+FEW = 10  # subjects, below which intervals are wide
+COLUMNS = (
+    variables.REPEAT_SUBJECTS,
+    variables.REPEAT_TAKES,
+    variables.ICC,
+    variables.ICC_LOW,
+    variables.ICC_HIGH,
+    variables.ICC_AGREEMENT,
+    variables.ICC_AGREEMENT_LOW,
+    variables.ICC_AGREEMENT_HIGH,
+    variables.WITHIN_SUBJECT_DEVIATION,
+    variables.REPEATABILITY_COEFFICIENT,
+    variables.DETECTABLE_CHANGE_OF_MEAN,
+    variables.REPEAT_BIAS,
+    variables.AGREEMENT_LOW,
+    variables.AGREEMENT_HIGH,
+)
+
+
+def repeatability(
+    cohort: Dataset, *, condition: str = NORMAL, quantities: Sequence[str] = ()
+) -> Dataset:
+    """Reliability and repeatability of quantities, from repeats and visits of subjects.
+
+    Parameters
+    ----------
+    cohort
+        ``db.cohort("tables")``.
+    condition
+        Condition of the takes.
+    quantities
+        Names of quantities; default albedo, surface reflectance and sigma_tr.
+
+    Returns
+    -------
+    Dataset
+        (quantity,), see the variables of the group "repeatability". sigma_tr is
+        compared by its natural logarithm. `icc` is ICC(1), the fraction of the variance
+        that is between subjects, from all takes; `icc_agreement` is ICC(2,1), from the
+        subjects with a value at every visit and repeat, whose common changes count as
+        variance; each with a 95 % interval. The repeatability coefficient,
+        1.96 sqrt(2) times the standard deviation within subjects, is also the smallest
+        detectable change of one subject. The limits of agreement are those of the
+        second take less the first. NaN where fewer than three subjects have two values.
+
+    Raises
+    ------
+    InputError
+        If fewer than three subjects have two takes in the condition.
+
+    References
+    ----------
+    Shrout and Fleiss 1979; McGraw and Wong 1996; Bland and Altman 1986, 1999; de Vet et
+    al. 2006.
+    """
+    require_comparable(cohort, "tables")
+    subjects = subjects_of(cohort)
+    conditions = subjects.attribute(CONDITION).values
+    rows = [i for i, name in enumerate(conditions) if name == condition]
+    names = [subjects.subject[i] for i in rows]
+    repeated = {name for name in names if names.count(name) > 1}
+    require(
+        len(repeated) >= MIN_SUBJECTS,
+        f"condition {condition}",
+        f"at least {MIN_SUBJECTS} subjects must have two takes",
+        f"{len(repeated)} of {len(set(names))} subjects",
+        "ingest and fit further visits or repeats",
+    )
+    chosen = cohort.isel(take=sorted(rows, key=lambda i: visit_of(subjects.take[i])))
+    measured = quantities_of(chosen, quantities)
+    occasions = [visit_of(str(take)) for take in chosen["take"].values]
+    columns = [_statistics(values, measured, occasions) for values in measured.values.T]
+    flags = []
+    if len(repeated) < FEW:
+        flags.append(f"fewer than {FEW} subjects with repeated takes")
+    return dataset(
+        {name: [column[name] for column in columns] for name in COLUMNS},
+        coords={"quantity": list(measured.names)},
+        attrs={
+            "condition": condition,
+            "logarithmic": list(itertools.compress(measured.names, measured.is_log)),
+            "flags": flags,
+            "skipped": skipped_takes(cohort),
+        },
+    )
+
+
+def _statistics(
+    values: Array, measured: Quantities, occasions: Sequence[tuple[int, int]]
+) -> dict[str, float]:
+    """Variables of one quantity of takes, which are in the order of their occasions."""
+    known = np.isfinite(values)
+    subjects = np.array(measured.subject)
+    of_subject = {
+        name: values[known & (subjects == name)]
+        for name in dict.fromkeys(measured.subject)
+    }
+    repeated = [x for x in of_subject.values() if len(x) > 1]
+    statistics = dict.fromkeys(COLUMNS, np.nan)
+    statistics[variables.REPEAT_SUBJECTS] = len(repeated)
+    statistics[variables.REPEAT_TAKES] = int(known.sum())
+    if len(repeated) < MIN_SUBJECTS:
+        return statistics
+    one_way = intraclass_correlation(values[known], subjects[known])
+    columns = sorted(set(occasions))
+    table = np.full((len(of_subject), len(columns)), np.nan)
+    numbers = {name: i for i, name in enumerate(of_subject)}
+    for name, occasion, value in zip(measured.subject, occasions, values, strict=True):
+        table[numbers[name], columns.index(occasion)] = value
+    agreement = agreement_correlation(table[np.isfinite(table).all(axis=1)])
+    coefficient = NORMAL_95 * np.sqrt(2) * one_way.within
+    change = np.array([x[1] - x[0] for x in repeated])
+    half = NORMAL_95 * change.std(ddof=1)
+    results = (
+        *one_way[:3],
+        *agreement,
+        one_way.within,
+        coefficient,
+        coefficient / np.sqrt(len(repeated)),
+        change.mean(),
+        change.mean() - half,
+        change.mean() + half,
+    )
+    return statistics | dict(zip(COLUMNS[2:], map(float, results), strict=True))
+
+
+def tabulate_repeatability(table: Dataset) -> Table:
+    """Header and one row per quantity."""
+    return table_of(table, COLUMNS, ("quantity",))
+
+
+def describe_repeatability(table: Dataset) -> list[str]:
+    """Notes on the table, one line each."""
+    lines = [
+        f"takes in the condition {table.attrs['condition']}; low and high are the ends of "
+        "95 % intervals",
+        "the repeatability coefficient is the smallest detectable change of one subject",
+    ]
+    if table.attrs["logarithmic"]:
+        lines.append("sigma_tr is compared by its natural logarithm")
+    return [*lines, *table.attrs["flags"]]
+
+
+def plot_repeatability(table: Dataset, *, ax: Axes | None = None) -> Axes:
+    """Plot the ICC of each quantity with its 95 % interval."""
+    names = table["quantity"].values.tolist()
+    ax = ax or plots.new_axes(6.5, 1.2 + 0.22 * len(names))
+    places = np.arange(float(len(names)))[::-1]
+    plots.intervals(ax, table, variables.ICC, places, fmt="o", color=plots.BLUE)
+    count = int(table[variables.REPEAT_SUBJECTS].max())
+    ax.set_yticks(places, names, fontsize=7)
+    ax.set_ylim(-0.6, len(names) - 0.4)
+    ax.set_xlim(min(0.0, *ax.get_xlim()), 1.02)
+    ax.set_xlabel(f"ICC(1), 95 % CI (n = {count} subjects with repeated takes)")
+    return ax
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the study of repeatability."""
+
+    condition: str = option("normal", "Condition of the takes.")
+    quantities: tuple[str, ...] = quantities_option()
+
+
+def compute(population: Population, parameters: Parameters) -> Results:
+    """The results of the study."""
+    table = repeatability(
+        population.cohort,
+        condition=parameters.condition,
+        quantities=parameters.quantities,
+    )
+    return {"repeatability": table}
+
+
+STUDY = Study(
+    name="repeatability",
+    description="reliability and repeatability of quantities, from repeated takes",
+    layout="tables",
+    parameters=Parameters,
+    compute=compute,
+    shown=("repeatability",),
+    tabulate=tabulate_repeatability,
+    plot=plot_repeatability,
+    describe=describe_repeatability,
+    columns_of_files=(
+        variables.ICC_AGREEMENT_LOW,
+        variables.ICC_AGREEMENT_HIGH,
+        variables.DETECTABLE_CHANGE_OF_MEAN,
+    ),
+)
