@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-CASES = 30
+CASES = 18
 SEED = 2005
 
 

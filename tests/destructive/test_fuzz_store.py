@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-CASES = 10
+CASES = 6
 SEED = 2006
 
 

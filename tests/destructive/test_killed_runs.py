@@ -14,7 +14,6 @@ RUNS = (
     "kill_fit --cases 3 --seed 3",
     "kill_fit --cases 1 --seed 3 --bucket",
     "kill_withdraw --cases 2",
-    "kill_withdraw --cases 1 --bucket",
     "kill_backup --every 90",
     "kill_cluster --cases 1 --seed 3",
     "stop_lease --cases 1",

@@ -9,7 +9,7 @@ from attack_devices import attacked_setup, violations
 
 pytestmark = pytest.mark.slow
 
-CASES = 300
+CASES = 120
 
 
 @pytest.mark.destructive
