@@ -13,7 +13,7 @@ from typing import Annotated
 
 import numpy as np
 
-from benchmarks.curves import MODELS, across, ring_mean, rings
+from benchmarks.curves_internal import MODELS, across, ring_mean, rings
 from skindb.optics.transport import random_walk
 
 ALBEDO = (0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 0.999)  # reduced

@@ -31,12 +31,12 @@ import numpy as np
 
 import skindb
 from benchmarks import ingest
-from benchmarks.curves import _p_values_of_scipy
+from benchmarks.curve import cpu_time
+from benchmarks.curves_internal import p_values_of_scipy
+from benchmarks.curves_surface import refit_curves, surface_curves
 from benchmarks.reads import measure
 from benchmarks.rendering import difference, sky
 from benchmarks.study_cost import grow
-from skindb.bench.curve import cpu_time
-from skindb.bench.surface import refit_curves, surface_curves
 from skindb.calibration.radiance import frame_mergers, read_view
 from skindb.format.folder import read_capture
 from skindb.numerics.inference import permutation_p
@@ -286,7 +286,7 @@ def permuting(bench: Bench) -> list[Row]:  # noqa: ARG001
         _ = orders @ values, orders @ values**2
 
     seconds = [cpu_time(work)[0] for work in (ours, products)]
-    theirs, _ = cpu_time(lambda: _p_values_of_scipy(values, group, 2000))
+    theirs, _ = cpu_time(lambda: p_values_of_scipy(values, group, 2000))
     work = "permutations, 30 quantities x 2,000"
     return [
         Row(work, seconds[0], "s", "matrix products", seconds[1], "0.02 s"),

@@ -17,7 +17,13 @@ from typing import Annotated, Any
 import numpy as np
 import xarray as xr
 
-from skindb.bench.photometry import ETA, SCAN_ERROR, Array, ModelSamples, model_samples
+from benchmarks.curves_photometry import (
+    ETA,
+    SCAN_ERROR,
+    Array,
+    ModelSamples,
+    model_samples,
+)
 from skindb.fit import estimate_diffuse_reflectance, estimate_normals, refit
 from skindb.reflectance.separation import surface_lobes
 from skindb.reflectance.tables import directional_albedo, stored_brdf

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from skindb.bench.surface import spiral
+from benchmarks.curves_surface import spiral
 from skindb.fit import estimate_diffuse_reflectance, fit_surface, reduce_basis, refit
 from skindb.optics.angles import half_difference
 from skindb.reflectance.dictionary import embedded_dictionary

@@ -11,7 +11,7 @@ from skindb.errors import Fault, InputError
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from skindb import analysis, bench, demo, export, fit, ingest, render, workflow
+    from skindb import analysis, demo, export, fit, ingest, render, workflow
 
     # the first word of a notebook, as in xarray and zarr
     from skindb.store.database import open  # noqa: A004
@@ -22,7 +22,6 @@ __all__ = [
     "InputError",
     "__version__",
     "analysis",
-    "bench",
     "demo",
     "export",
     "fit",
@@ -39,7 +38,6 @@ __getattr__, __dir__, _ = lazy_loader.attach(
     __name__,
     submodules=[
         "analysis",
-        "bench",
         "demo",
         "export",
         "fit",

@@ -94,7 +94,7 @@ def test_commands__joins_lines_and_drops_prompts_and_comments():
 
 def test_figure_faults__requires_a_command_in_every_section_with_figures():
     page = (
-        "# Results\n\n## Good\n\n```bash\nskindb bench\n```\n\n3 s\n\n## Bad\n\n4 "
+        "# Results\n\n## Good\n\n```bash\nskindb verify DB\n```\n\n3 s\n\n## Bad\n\n4 "
         "s\n\n## Words\n\nNothing.\n"
     )
     (fault,) = check_docs.figure_faults("page", page)
@@ -102,7 +102,7 @@ def test_figure_faults__requires_a_command_in_every_section_with_figures():
 
 
 def test_figure_faults__lets_subsections_inherit_the_command_before_them_only():
-    command = "```bash\nskindb bench\n```\n\n"
+    command = "```bash\nskindb verify DB\n```\n\n"
     page = f"# Results\n\n## Good\n\n{command}### First\n\n1 s\n\n"
     page += (
         f"## Parts\n\nText.\n\n### Good part\n\n{command}2 s\n\n### Bad part\n\n3 s\n"

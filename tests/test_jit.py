@@ -180,7 +180,6 @@ IMPORTED = (
     "render.rendering",
     "export.gltf",
     "virtual.capture",
-    "bench.run",
 )
 
 

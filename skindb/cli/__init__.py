@@ -22,7 +22,7 @@ from skindb.cli.shared import echo_json, fault_lines
 from skindb.cli.studies import analyze, tidy
 from skindb.cli.subjects import consent, refresh, release, withdraw
 from skindb.cli.terminal import echo
-from skindb.cli.upkeep import audit, backup, bench, clean, info, restore, verify
+from skindb.cli.upkeep import audit, backup, clean, info, restore, verify
 from skindb.errors import Fault, InputError, SkindbWarning, escaped, system_fault
 from skindb.files import private_umask
 
@@ -69,7 +69,6 @@ for _command in (
     clean,
     backup,
     restore,
-    bench,
 ):
     cli.add_command(_command)
 

@@ -1,6 +1,4 @@
-"""Commands for the maintenance of databases, and the benchmark: info, audit, verify, clean,
-backup, restore, bench.
-"""
+"""Commands for the maintenance of databases: info, audit, verify, clean, backup, restore."""
 
 from __future__ import annotations
 
@@ -13,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import skindb
-from skindb.bench import KERNELS
 from skindb.cli.options import DB, PATH, asked, command
 from skindb.cli.shared import (
     aligned,
@@ -24,8 +21,7 @@ from skindb.cli.shared import (
     existing,
 )
 from skindb.cli.subjects import stale_as_json
-from skindb.cli.terminal import bar
-from skindb.errors import Fault, InputError, input_error
+from skindb.errors import InputError, input_error
 
 if TYPE_CHECKING:
     from skindb.store import BackupReport, Database, Garbage, Restored
@@ -287,37 +283,6 @@ def _garbage_line(item: Garbage) -> str:
     return f"{item.key}  {item.bytes / 1e6:.1f} MB  {item.what}" + (
         f"  (kept: {item.kept})" if item.kept else ""
     )
-
-
-@command
-@click.option(
-    "--out", type=PATH, default=Path("bench"), help="Folder for bench.json and plots."
-)
-@click.option(
-    "--only",
-    multiple=True,
-    type=click.Choice(KERNELS),
-    help="Kernel to measure (may be given several times).  [default: all]",
-)
-@click.option(
-    "--quick",
-    is_flag=True,
-    help="Measure smaller problems, which takes half a minute instead of several minutes.",
-)
-def bench(out: Path, only: tuple[str, ...], quick: bool) -> None:
-    """Measure error against run time of every kernel.
-
-    Methods that fail are listed with the reason. A kernel that stops with an error does
-    not stop the others, and the command exits with 1.
-    """
-    result = skindb.bench.run_bench(out, only=only, quick=quick, progress=bar())
-    failures = [f"fails: {line}" for line in result["failures"]]
-    faults = [
-        Fault(f"bench {kernel}", "every curve must be measured", reason)
-        for kernel, reason in result["errors"].items()
-    ]
-    table = aligned(skindb.bench.table_of(result))
-    emit(result, [*table, "", *failures, str(out / "bench.json")], faults)
 
 
 @command

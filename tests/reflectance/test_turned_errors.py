@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from skindb.bench.surface import ETA, strip
+from benchmarks.curves_surface import ETA, strip
 from skindb.fit.surface import NOISE_FLOOR_SURFACE
 from skindb.optics.angles import half_difference
 from skindb.optics.fresnel import fresnel_transmittance

@@ -13,7 +13,7 @@ from scipy.optimize import nnls
 from sklearn.decomposition import NMF
 from sklearn.exceptions import ConvergenceWarning
 
-from skindb.bench.curve import Curve, Point, cpu_time
+from benchmarks.curve import Curve, Point, cpu_time
 from skindb.fit.surface import NOISE_FLOOR_SURFACE
 from skindb.numerics.factorise import nmf, relative_error
 from skindb.optics.angles import half_difference

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb.bench.curve import Curve, Point, cpu_time
-from skindb.bench.surface import spiral
+from benchmarks.curve import Curve, Point, cpu_time
+from benchmarks.curves_surface import spiral
 from skindb.calibration._merge_kernels import OK
 from skindb.calibration.radiance import merge_exposures
 from skindb.fit import estimate_diffuse_reflectance, estimate_normals

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from functools import lru_cache, partial
 from typing import Any
 
+import mpmath
 import numpy as np
 from scipy.optimize import brentq
 
-from skindb.bench.curve import Curve, Point, cpu_time
-from skindb.bench.surface import spiral
-from skindb.errors import input_error
+from benchmarks.curve import Curve, Point, cpu_time
+from benchmarks.curves_surface import spiral
 from skindb.fit.translucency import ProbeFit, fit_profile
 from skindb.optics.diffusion import (
     S_MAX,
@@ -107,22 +107,7 @@ def _by_brentq(diffuse: Array) -> Array:
     return np.array(roots)
 
 
-def require_mpmath() -> Any:
-    """Import mpmath; raises `InputError` with the install command if it is missing."""
-    try:
-        import mpmath
-    except ImportError:
-        raise input_error(
-            "bench inverse",
-            "mpmath must be installed",
-            "no module mpmath",
-            "pip install 'skindb[bench]', or choose other kernels with --only",
-        ) from None
-    return mpmath
-
-
 def _exact(value: float) -> float:
-    mpmath = require_mpmath()
     with mpmath.workdps(40):
         b = mpmath.mpf(4) / 3 * mpmath.mpf(boundary_factor(ETA))
         bracket = (mpmath.mpf("1e-12"), mpmath.sqrt(3))

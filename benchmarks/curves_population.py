@@ -6,7 +6,7 @@ from importlib.util import find_spec
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from skindb.bench.curve import Curve, Point, cpu_time
+from benchmarks.curve import Curve, Point, cpu_time
 from skindb.numerics.texture import (
     LEVELS,
     build,
