@@ -38,6 +38,7 @@ from .groups import (
     group_effects,
     plot_group_effects,
 )
+from .linear_model import describe_model, linear_model, plot_model
 from .maps import (
     describe_effect_maps,
     effect_maps,
@@ -99,6 +100,7 @@ __all__ = [
     "describe_edit",
     "describe_effect_maps",
     "describe_group_effects",
+    "describe_model",
     "describe_repeatability",
     "describe_study",
     "doubtful_landmarks",
@@ -106,6 +108,7 @@ __all__ = [
     "face_components",
     "group_effects",
     "groups_by",
+    "linear_model",
     "mean_face",
     "plot_albedo",
     "plot_basis_size",
@@ -117,6 +120,7 @@ __all__ = [
     "plot_group_effects",
     "plot_group_lobes",
     "plot_group_spheres",
+    "plot_model",
     "plot_repeatability",
     "plot_study",
     "plot_traits",

@@ -222,4 +222,5 @@ STUDY = Study(
         variables.ICC_AGREEMENT_HIGH,
         variables.DETECTABLE_CHANGE_OF_MEAN,
     ),
+    counts_takes=True,
 )

@@ -11,6 +11,7 @@ from skindb.analysis.components import STUDY as COMPONENTS
 from skindb.analysis.correlations import STUDY as CORRELATIONS
 from skindb.analysis.coverage import STUDY as COVERAGE
 from skindb.analysis.groups import STUDY as GROUPS
+from skindb.analysis.linear_model import STUDY as MODEL
 from skindb.analysis.maps import STUDY as MAPS
 from skindb.analysis.repeatability import STUDY as REPEATABILITY
 from skindb.analysis.study import Study, Table
@@ -35,6 +36,7 @@ STUDIES: dict[str, Study] = {
         COVERAGE,
         SURFACE,
         REPEATABILITY,
+        MODEL,
     )
 }
 

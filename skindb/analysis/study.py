@@ -166,6 +166,8 @@ class Study:
     compares_normal
         Whether it compares subjects in the condition normal, so that those without such
         a take are reported as skipped.
+    counts_takes
+        Whether visits and repeats of a subject count by themselves, not by their mean.
     """
 
     name: str
@@ -182,6 +184,7 @@ class Study:
     uses_registration: bool = False
     absolute: bool = False
     compares_normal: bool = False
+    counts_takes: bool = False
 
     @property
     def registers(self) -> bool:

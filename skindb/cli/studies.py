@@ -198,6 +198,10 @@ def _study_command(study: Declaration) -> click.Command:
     studying = click.command(study.name, help=f"Study the {study.description}.")(run)
     if study.name == "translucency":
         studying.params += FACES
+    if study.name == "model":
+        formula = click.Argument(["formula"])
+        options = [option for option in studying.params if option.name != "formula"]
+        studying.params = [formula, *options]
     return studying
 
 

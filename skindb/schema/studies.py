@@ -365,6 +365,51 @@ CORRELATION_COUNT = declare(
     "subjects with both components",
 )
 
+# linear_model
+MODEL_ESTIMATE = declare(
+    "float64 linear_model/model_estimate(quantity, term) [1]",
+    "coefficient of a term, per unit of the quantity",
+)
+MODEL_ERROR = declare(
+    "float64 linear_model/model_error(quantity, term) [1]",
+    "standard error of the coefficient",
+)
+MODEL_ESTIMATE_LOW = declare(
+    "float64 linear_model/model_estimate_low(quantity, term) [1]",
+    "lower end of the 95 % interval of the coefficient",
+)
+MODEL_ESTIMATE_HIGH = declare(
+    "float64 linear_model/model_estimate_high(quantity, term) [1]",
+    "upper end of the 95 % interval of the coefficient",
+)
+MODEL_P = declare(
+    "float64 linear_model/model_p(quantity, term) [1]",
+    "p value of the coefficient, of this quantity alone",
+)
+MODEL_P_FALSE_DISCOVERY = declare(
+    "float64 linear_model/model_p_false_discovery(quantity, term) [1]",
+    "p value adjusted so that on average this fraction of the stated effects of a "
+    "term are none",
+    "Benjamini and Hochberg 1995",
+)
+MODEL_DEGREES_OF_FREEDOM = declare(
+    "float64 linear_model/model_degrees_of_freedom(quantity, term) [1]",
+    "degrees of freedom of the p value, between or within subjects",
+    "Schluchter and Elashoff 1990",
+)
+MODEL_DEVIATION = declare(
+    "float64 linear_model/model_deviation(quantity, effect) [1]",
+    "standard deviation of a random effect between subjects, and of the residual",
+)
+MODEL_TAKES = declare(
+    "int32 linear_model/model_takes(quantity) [1]",
+    "takes with a value and all attributes of the formula",
+)
+MODEL_SUBJECTS = declare(
+    "int32 linear_model/model_subjects(quantity) [1]",
+    "subjects of these takes",
+)
+
 # repeatability
 REPEAT_SUBJECTS = declare(
     "int32 repeatability/repeat_subjects(quantity) [1]",

@@ -527,7 +527,7 @@ def _derivation(
         seeds={"analyze": requested["seed"]} if "seed" in requested else {},
         skipped=skipped,
         outdated=outdated,
-        visits=describe_visits(cohort),
+        visits="" if record.counts_takes else describe_visits(cohort),
         attributes_digest=_attributes_digest(cohort),
     )
 

@@ -31,7 +31,7 @@ DIMS = set(
     "measure lobe v u component region xyz uv "
     "corner landmark row col coefficient axis theta_h theta_d phi_d photograph image_row image_col "
     "group k take edge bin trait side level status samples space statistic "
-    "contrast quantity attribute attribute_2 "
+    "contrast quantity term effect attribute attribute_2 "
     "part cell chromophore pair take_2 placement pressure_sample step "
     "response_level exposure correction".split()
 )

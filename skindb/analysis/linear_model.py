@@ -1,0 +1,445 @@
+"""Linear and mixed models of quantities by a formula, such as
+``ITA ~ treatment * visit + age + (1 | subject)``.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Sequence
+from dataclasses import MISSING, dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+from xarray import Dataset
+
+from skindb import plots
+from skindb.analysis.quantities import QUANTITIES
+from skindb.analysis.study import (
+    Population,
+    Results,
+    Study,
+    Table,
+    skipped_takes,
+    table_of,
+)
+from skindb.analysis.subjects import CONDITION, NORMAL
+from skindb.analysis.tidy import COLUMNS as VALUES
+from skindb.analysis.tidy import tidy
+from skindb.errors import InputError, input_error, require
+from skindb.parameters import option
+from skindb.schema import dataset, variables
+from skindb.schema.cohort import require_comparable
+from skindb.types import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+SUBJECT = "subject"
+RESIDUAL = "residual"
+INTERCEPT = "Intercept"
+EXAMPLE = "write, for example: ITA ~ treatment * visit + age + (1 | subject)"
+# what a formula may consist of: formulaic would evaluate any Python expression
+NAME = r"[A-Za-z_]\w*|`[^`]+`"
+TERMS = re.compile(
+    rf"(?:\s|C\(\s*(?:{NAME})\s*\)|(?:{NAME})(?!\s*\()|[01]\b|[-+*:/()])*"
+)
+RANDOM = re.compile(r"\+?\s*\(([^()|]*)\|([^()|]*)\)")
+# variance of a random effect over that of the residual, below which it is at its bound
+BOUND = 1e-6
+COLUMNS = (
+    variables.MODEL_ESTIMATE,
+    variables.MODEL_ERROR,
+    variables.MODEL_ESTIMATE_LOW,
+    variables.MODEL_ESTIMATE_HIGH,
+    variables.MODEL_P,
+    variables.MODEL_P_FALSE_DISCOVERY,
+    variables.MODEL_DEGREES_OF_FREEDOM,
+)
+
+
+@dataclass(frozen=True)
+class MixedModel:
+    """A formula in parts."""
+
+    quantity: str
+    is_log: bool
+    fixed: str  # terms, as of formulaic
+    slopes: tuple[str, ...] = ()  # numbers whose slopes differ between subjects
+    is_mixed: bool = False  # whether subjects have intercepts of their own
+
+    @classmethod
+    def of(cls, formula: str) -> MixedModel:
+        """Parse a formula; `InputError` for one that has other parts."""
+        left, separator, right = formula.partition("~")
+        logarithm = re.fullmatch(r"log\((.*)\)", left.strip())
+        quantity = (logarithm[1] if logarithm else left).strip()
+        random = RANDOM.findall(right)
+        fixed = RANDOM.sub("", right).strip().removeprefix("+").strip() or "1"
+        faults = {
+            "must have one ~ between a quantity and terms": not separator
+            or "~" in right,
+            f"must begin with one of {', '.join(QUANTITIES)}": quantity
+            not in QUANTITIES,
+            "has at most one random part, (1 | subject) or (1 + NAME | subject)": len(
+                random
+            )
+            > 1,
+            "has the terms NAME, C(NAME), 0 and 1, joined by + - * : / ( )": not TERMS.fullmatch(
+                fixed
+            ),
+        }
+        slopes: list[str] = []
+        for effects, group in random:
+            slopes = [part.strip() for part in effects.split("+")]
+            slopes = [part for part in slopes if part != "1"]
+            faults["has random effects of subjects alone"] = group.strip() != SUBJECT
+            faults["has random effects 1 and NAME"] = not all(
+                re.fullmatch(NAME, part) for part in slopes
+            )
+        if broken := [rule for rule, is_broken in faults.items() if is_broken]:
+            raise input_error(f"formula {formula}", broken[0], "another form", EXAMPLE)
+        return cls(
+            quantity,
+            logarithm is not None,
+            fixed,
+            tuple(part.strip("`") for part in slopes),
+            bool(random),
+        )
+
+
+def linear_model(cohort: Dataset, *, formula: str) -> Dataset:
+    """Fit a linear or mixed model to a quantity, for each region or site and channel.
+
+    Parameters
+    ----------
+    cohort
+        ``db.cohort("tables")``.
+    formula
+        Quantity, or its logarithm ``log(NAME)``, ``~`` and terms of attributes, condition
+        and visit, as of formulaic; perhaps with ``(1 | subject)``, or with ``(1 + NAME |
+        subject)`` for slopes that differ between subjects. Takes in other conditions
+        than normal are used if the formula names the condition.
+
+    Returns
+    -------
+    Dataset
+        (quantity, term), see the variables of the group "linear_model": estimates by restricted
+        maximum likelihood (statsmodels' MixedLM; least squares without a random part),
+        Student's intervals and p values with the degrees of freedom between subjects
+        for terms that are constant within subjects or have random slopes, and within
+        subjects for others. Terms of one number are per unit of it, those of words less
+        the first word in the alphabet. Attribute "flags".
+
+    Raises
+    ------
+    InputError
+        If the formula has other parts or unknown names, if no region has enough takes,
+        or if subjects have several takes and there is no random part.
+
+    References
+    ----------
+    Laird and Ware 1982; Schluchter and Elashoff 1990 (degrees of freedom).
+    """
+    require_comparable(cohort, "tables")
+    model = MixedModel.of(formula)
+    frame = tidy(cohort)
+    known = [name for name in frame.columns if name not in (*VALUES, "take")]
+    used = _names(model, known)
+    frame = frame[frame["quantity"] == model.quantity]
+    if CONDITION not in used:
+        frame = frame[frame[CONDITION] == NORMAL]
+    if model.is_log:
+        positive = frame["value"].where(frame["value"] > 0)
+        frame = frame.assign(value=np.log(positive))
+    frame = frame.dropna(subset=["value", *used])
+    fits: dict[str, _Fit] = {}
+    flags: list[str] = []
+    for (region, channel), part in frame.groupby(
+        ["region", "channel"], sort=False, dropna=False
+    ):
+        words = [model.quantity, region, channel]
+        name = " ".join(str(word) for word in words if isinstance(word, str))
+        try:
+            fits[name] = _fit(model, part)
+        except InputError as error:
+            flags.append(f"{name}: excluded, {error.faults[0].found}")
+        else:
+            flags += [f"{name}: {flag}" for flag in fits[name].flags]
+    require(
+        fits,
+        f"formula {formula}",
+        "some region must determine it",
+        "; ".join(flags) or "no take with all its variables",
+        "use fewer terms, or add takes",
+    )
+    return _labelled(model, fits, formula, flags, cohort)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A model of one region and channel."""
+
+    table: pd.DataFrame  # term -> variables of COLUMNS except the false discovery rate
+    deviation: dict[str, float]  # random effect, or the residual -> standard deviation
+    takes: int
+    subjects: int
+    flags: tuple[str, ...]
+
+
+def _names(model: MixedModel, known: Sequence[str]) -> list[str]:
+    """Columns that a model uses."""
+    words = {word.strip("`") for word in re.findall(NAME, model.fixed)} - {"C"}
+    names = sorted({*words, *model.slopes, SUBJECT})
+    if unknown := [name for name in names if name not in known]:
+        raise input_error(
+            f"formula: {', '.join(unknown)}",
+            "must be columns of the takes",
+            "unknown names",
+            f"choose from: {', '.join(known)}",
+        )
+    return names
+
+
+def _fit(model: MixedModel, rows: pd.DataFrame) -> _Fit:
+    """Fit a model to the rows of one region and channel, which lack no value."""
+    # takes longer to import than most commands to run
+    from formulaic import model_matrix
+    from formulaic.errors import FormulaicError
+
+    subjects = rows[SUBJECT].to_numpy(str)
+    people = len(set(subjects))
+    try:
+        design = model_matrix(model.fixed, rows, na_action="raise")
+    except (FormulaicError, ValueError, TypeError, SyntaxError) as broken:
+        raise input_error("formula", "must fit the data", f"{broken}"[:200]) from None
+    x = np.asarray(design, float)
+    terms = [str(name) for name in design.columns]
+    is_between = np.array(
+        [
+            len({*zip(subjects, column, strict=True)}) == people
+            or not {*re.split(r"[:\[]", term)}.isdisjoint(model.slopes)
+            for term, column in zip(terms, x.T, strict=True)
+        ]
+    )
+    within = len(rows) - people - int((~is_between).sum())
+    free = np.where(is_between, people - is_between.sum(), within).astype(float)
+    if not model.is_mixed:
+        free = np.full(len(terms), float(len(rows) - len(terms)))
+    require(
+        free.min() > 0 and np.linalg.matrix_rank(x) == len(terms),
+        "formula",
+        "must be determined",
+        f"{len(rows)} takes of {people} subjects do not determine {len(terms)} terms",
+    )
+    require(
+        model.is_mixed or people == len(rows),
+        "formula",
+        "must have (1 | subject) if subjects have several takes",
+        f"{len(rows)} takes of {people} subjects without (1 | subject)",
+    )
+    y = rows["value"].to_numpy(float)
+    scale = float(np.std(y)) or 1.0  # so that the solver converges
+    random = np.column_stack(
+        [np.ones(len(rows)), *(_numbers(rows, name) for name in model.slopes)]
+    )
+    estimate, covariance, spread = _solve(
+        y / scale, x, subjects, random if model.is_mixed else None
+    )
+    error = scale * np.sqrt(np.diag(covariance))
+    half = stats.t.ppf(0.975, free) * error
+    estimate = scale * estimate
+    columns = (
+        estimate,
+        error,
+        estimate - half,
+        estimate + half,
+        2 * stats.t.sf(np.abs(estimate / error), free),
+        free,
+    )
+    names = [name for name in COLUMNS if name != variables.MODEL_P_FALSE_DISCOVERY]
+    effects = [INTERCEPT, *model.slopes] if model.is_mixed else []
+    at_bound = [
+        effect
+        for effect, value in zip(effects, spread, strict=False)
+        if value**2 < BOUND * spread[-1] ** 2
+    ]
+    return _Fit(
+        pd.DataFrame(dict(zip(names, columns, strict=True)), terms),
+        dict(zip([*effects, RESIDUAL], scale * spread, strict=True)),
+        len(rows),
+        people,
+        tuple(f"no variance of {effect} between subjects" for effect in at_bound),
+    )
+
+
+def _numbers(rows: pd.DataFrame, name: str) -> Array:
+    """A column as numbers."""
+    try:
+        return np.asarray(rows[name], float)
+    except (TypeError, ValueError):
+        raise input_error(
+            "formula", "random slopes are of numbers", f"{name} is not a number"
+        ) from None
+
+
+def _solve(
+    y: Array, x: Array, subjects: Array, random: Array | None
+) -> tuple[Array, Array, Array]:
+    """Estimates (p,), their covariance (p, p), and standard deviations of the random
+    effects and of the residual.
+    """
+    if random is None:
+        estimate = np.linalg.lstsq(x, y, rcond=None)[0]
+        variance = float(((y - x @ estimate) ** 2).sum()) / (len(y) - x.shape[1])
+        return estimate, variance * np.linalg.inv(x.T @ x), np.sqrt([variance])
+    # takes a second to import
+    from statsmodels.regression.mixed_linear_model import MixedLM
+
+    with warnings.catch_warnings():
+        # a variance at its bound 0, which is reported
+        warnings.simplefilter("ignore")
+        fitted = MixedLM(y, x, groups=subjects, exog_re=random).fit(reml=True)
+    variance = float(fitted.scale)
+    between = np.atleast_2d(np.asarray(fitted.cov_re, float))
+    information = np.zeros((x.shape[1],) * 2)
+    for subject in dict.fromkeys(subjects.tolist()):
+        rows = subjects == subject
+        covariance = random[rows] @ between @ random[rows].T
+        covariance += variance * np.eye(len(covariance))
+        information += x[rows].T @ np.linalg.solve(covariance, x[rows])
+    spread = np.sqrt([*np.maximum(np.diag(between), 0), variance])
+    return np.asarray(fitted.fe_params, float), np.linalg.inv(information), spread
+
+
+def _labelled(
+    model: MixedModel,
+    fits: dict[str, _Fit],
+    formula: str,
+    flags: list[str],
+    cohort: Dataset,
+) -> Dataset:
+    """The Dataset of all models."""
+    terms = list(
+        dict.fromkeys(term for fit in fits.values() for term in fit.table.index)
+    )
+    tables = [fit.table.reindex(terms) for fit in fits.values()]
+    values = {name: np.stack([table[name] for table in tables]) for name in tables[0]}
+    p = values[variables.MODEL_P]
+    discovered = np.full(p.shape, np.nan)
+    for column in range(len(terms)):
+        is_known = np.isfinite(p[:, column])
+        discovered[is_known, column] = stats.false_discovery_control(
+            p[is_known, column]
+        )
+    effects = list(next(iter(fits.values())).deviation)
+    return dataset(
+        values
+        | {
+            variables.MODEL_P_FALSE_DISCOVERY: discovered,
+            variables.MODEL_DEVIATION: [
+                [*fit.deviation.values()] for fit in fits.values()
+            ],
+            variables.MODEL_TAKES: [fit.takes for fit in fits.values()],
+            variables.MODEL_SUBJECTS: [fit.subjects for fit in fits.values()],
+        },
+        coords={"quantity": list(fits), "term": terms, "effect": effects},
+        attrs={
+            "formula": formula,
+            "condition": "" if CONDITION in _words(model) else NORMAL,
+            "flags": flags,
+            "skipped": skipped_takes(cohort),
+        },
+    )
+
+
+def _words(model: MixedModel) -> set[str]:
+    return {word.strip("`") for word in re.findall(NAME, model.fixed)}
+
+
+def tabulate_model(table: Dataset) -> Table:
+    """Header and one row per quantity and term."""
+    counts = {
+        name: table[name].broadcast_like(table[variables.MODEL_ESTIMATE])
+        for name in (variables.MODEL_TAKES, variables.MODEL_SUBJECTS)
+    }
+    return table_of(table.assign(counts), [*COLUMNS, *counts], ("quantity", "term"))
+
+
+def describe_model(table: Dataset) -> list[str]:
+    """The formula, deviations of the random effects, and flags, one line each."""
+    lines = [f"{table.attrs['formula']}; every visit and repeat counts"]
+    if table.attrs["condition"]:
+        lines[0] += f", in the condition {table.attrs['condition']}"
+    deviations = table[variables.MODEL_DEVIATION]
+    for quantity in table["quantity"].values.tolist():
+        values = deviations.sel(quantity=quantity)
+        words = [f"{float(x):.3g} ({x['effect'].item()})" for x in values]
+        lines.append(f"{quantity}: standard deviations {', '.join(words)}")
+    interval = (
+        "low and high are the ends of 95 % intervals, p values are of one region alone"
+    )
+    return [*lines, interval, *table.attrs["flags"]]
+
+
+def plot_model(table: Dataset, *, ax: Axes | None = None) -> Axes:
+    """Plot the estimates over their errors, with 95 % intervals, one row per quantity;
+    colours are terms.
+    """
+    terms = [term for term in table["term"].values.tolist() if term != INTERCEPT]
+    names = table["quantity"].values.tolist()
+    ax = ax or plots.new_axes(6.5, 1.2 + 0.3 * len(names))
+    ax.axvline(0, color="0.6", linewidth=1)
+    error = table[variables.MODEL_ERROR]
+    shown = table[list(COLUMNS[:4])] / error
+    places = np.arange(float(len(names)))[::-1]
+    for i, term in enumerate(terms):
+        colour = plots.CYCLE[i % len(plots.CYCLE)]
+        ax.plot([], [], "o", color=colour, markersize=4, label=term)
+        plots.significant_intervals(
+            ax,
+            shown.sel(term=term, drop=True),
+            variables.MODEL_ESTIMATE,
+            places + 0.6 * ((i + 0.5) / len(terms) - 0.5),
+            table[variables.MODEL_P].sel(term=term).values < 0.05,
+            colour=colour,
+        )
+    ax.set_yticks(places, names, fontsize=7)
+    count = int(table[variables.MODEL_SUBJECTS].max())
+    ax.set_xlabel(
+        f"estimate over its standard error, 95 % CI (n = {count})\nfilled: p < 0.05"
+    )
+    plots.legend_above(ax)
+    return ax
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the study of a model."""
+
+    formula: str = option(
+        MISSING,
+        "Formula, such as: ITA ~ treatment * visit + age + (1 | subject).",
+    )
+
+
+def compute(population: Population, parameters: Parameters) -> Results:
+    """The results of the study."""
+    return {"linear_model": linear_model(population.cohort, formula=parameters.formula)}
+
+
+STUDY = Study(
+    name="model",
+    description="effects of attributes, conditions and visits by a formula",
+    layout="tables",
+    parameters=Parameters,
+    compute=compute,
+    shown=("linear_model",),
+    tabulate=tabulate_model,
+    plot=plot_model,
+    describe=describe_model,
+    columns_of_files=(variables.MODEL_P_FALSE_DISCOVERY,),
+    counts_takes=True,
+)

@@ -1,0 +1,175 @@
+"""Models by a formula: the numbers of statsmodels, false positives, and what is refused."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pandas as pd
+import pytest
+import statsmodels.formula.api as smf
+from planted_tables import planted_tables
+from scipy import stats
+
+from skindb.analysis import linear_model, tidy
+from skindb.analysis.linear_model import MixedModel, _fit
+from skindb.errors import InputError
+
+PEOPLE, VISITS = 24, 4
+FORMULA = "R_d ~ treatment * visit + age + (1 | subject)"
+
+
+def planted(*, effect=0.0, seed=5):
+    """Subjects at four visits; under cream, R_d rises by `effect` at each visit."""
+    rng = np.random.default_rng(seed)
+    names = np.repeat([f"S{i:02d}" for i in range(PEOPLE)], VISITS)
+    visit = np.tile(np.arange(1, VISITS + 1), PEOPLE)
+    is_treated = np.repeat(np.arange(PEOPLE) % 2, VISITS)
+    cohort = planted_tables(
+        names.tolist(),
+        albedo=effect * is_treated * visit + rng.normal(0, 0.01, len(names)),
+        treatment=np.where(is_treated, "cream", "none"),
+        age=np.repeat(rng.integers(20, 60, PEOPLE), VISITS),
+    )
+    takes = [
+        name if number == 1 else f"{name}.normal.{number}"
+        for name, number in zip(names, visit, strict=True)
+    ]
+    return cohort.assign_coords(take=takes)
+
+
+def by_statsmodels(cohort, formula, **options):
+    frame = tidy(cohort)
+    rows = frame[
+        (frame.quantity == "R_d") & (frame.region == "face") & (frame.channel == "G")
+    ]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return smf.mixedlm(formula, rows, groups="subject", **options).fit(reml=True)
+
+
+@pytest.mark.parametrize(
+    ("random", "options"),
+    [("(1 | subject)", {}), ("(1 + visit | subject)", {"re_formula": "visit"})],
+)
+def test_linear_model__has_the_numbers_of_statsmodels(random, options):
+    """The solvers stop at other places: 0.1 % of the estimates' errors is allowed, and 1 %
+    of the errors, which statsmodels takes from the curvature.
+    """
+    cohort = planted(effect=0.002).isel(region=[0])
+    ours = linear_model(cohort, formula=f"R_d ~ treatment * visit + age + {random}")
+    ours = ours.sel(quantity="R_d face G")
+    theirs = by_statsmodels(cohort, "value ~ treatment * visit + age", **options)
+    terms = ours["term"].values.tolist()
+    assert set(terms) == set(theirs.fe_params.index)
+    error = theirs.bse_fe[terms]
+    np.testing.assert_allclose(ours["model_error"], error, rtol=0.01)
+    change = ours["model_estimate"].values - theirs.fe_params[terms]
+    assert (np.abs(change) < 1e-3 * error).all()
+    deviation = ours["model_deviation"].sel(effect=["Intercept", "residual"]).values
+    expected = np.sqrt([theirs.cov_re.iloc[0, 0], theirs.scale])
+    np.testing.assert_allclose(deviation, expected, rtol=0.01)
+    t = np.abs(ours["model_estimate"] / ours["model_error"])
+    p = 2 * stats.t.sf(t, ours["model_degrees_of_freedom"])
+    np.testing.assert_allclose(ours["model_p"], p)
+    assert (int(ours["model_takes"]), int(ours["model_subjects"])) == (96, 24)
+
+
+def test_linear_model__degrees_of_freedom_by_hand():
+    table = linear_model(planted(), formula=FORMULA).isel(quantity=0)
+    free = dict(
+        zip(table["term"].values, table["model_degrees_of_freedom"].values, strict=True)
+    )
+    # between 24 subjects: intercept, treatment, age; within 96 takes: visit, interaction
+    assert free == {
+        "Intercept": 21,
+        "treatment[T.none]": 21,
+        "age": 21,
+        "visit": 70,
+        "treatment[T.none]:visit": 70,
+    }
+
+
+def test_linear_model__false_positives_are_5_per_cent():
+    """200 null frames: a binomial of 5 % is below 2 or above 20 in 1 of 500. The
+    effects of treatment are between subjects, that of visits within them.
+    """
+    rng = np.random.default_rng(11)
+    subjects = np.repeat([f"S{i}" for i in range(12)], 3)
+    model = MixedModel.of("R_d ~ group + visit + (1 | subject)")
+    false = np.zeros(3)
+    for _ in range(200):
+        value = np.repeat(rng.normal(0, 1.0, 12), 3) + rng.normal(0, 0.7, 36)
+        rows = pd.DataFrame(
+            {
+                "subject": subjects,
+                "group": np.repeat(rng.permutation([0, 1] * 6), 3),
+                "visit": np.tile([1, 2, 3], 12),
+                "value": value,
+            }
+        )
+        false += _fit(model, rows).table["model_p"].to_numpy() < 0.05
+    assert ((false >= 2) & (false <= 20)).all()
+
+
+def test_linear_model__without_a_random_part_is_least_squares():
+    cohort = planted(effect=0.002).isel(take=slice(0, None, VISITS))
+    table = linear_model(cohort, formula="log(R_d) ~ treatment + age")
+    frame = tidy(cohort).query(
+        "quantity == 'R_d' and region == 'beard' and channel == 'B'"
+    )
+    theirs = smf.ols("np.log(value) ~ treatment + age", frame).fit()
+    ours = table.sel(quantity="R_d beard B")
+    terms = ours["term"].values.tolist()
+    np.testing.assert_allclose(ours["model_estimate"], theirs.params[terms])
+    np.testing.assert_allclose(ours["model_error"], theirs.bse[terms])
+    np.testing.assert_allclose(ours["model_p"], theirs.pvalues[terms])
+
+
+def test_linear_model__no_variance_between_subjects_is_flagged():
+    """The residuals are as large within as between subjects by construction."""
+    cohort = planted()
+    values = cohort["region_diffuse_reflectance"]
+    rest = np.tile([0.01, -0.01, 0.01, -0.01], PEOPLE)[:, None, None]
+    level = cohort["region_diffuse_reflectance"].copy(
+        data=np.broadcast_to(0.4 + rest, values.shape)
+    )
+    table = linear_model(
+        cohort.assign(region_diffuse_reflectance=level),
+        formula="R_d ~ visit + (1 | subject)",
+    )
+    assert (
+        "R_d face R: no variance of Intercept between subjects" in table.attrs["flags"]
+    )
+    assert np.isfinite(table["model_error"]).all()
+
+
+@pytest.mark.parametrize(
+    ("formula", "said"),
+    [
+        ("R_d", "must have one ~"),
+        ("height ~ age", "must begin with one of R_d, surface reflectance"),
+        (
+            "R_d ~ height + (1 | subject)",
+            "height: must be columns .* choose from: subject",
+        ),
+        ("R_d ~ age + (1 | site)", "random effects of subjects alone"),
+        ("R_d ~ age + (1 | subject/visit)", "random effects of subjects alone"),
+        (
+            "R_d ~ age + (1 | subject) + (0 + visit | subject)",
+            "at most one random part",
+        ),
+        ("R_d ~ age + (0 + visit | subject)", "has random effects 1 and NAME"),
+        ("R_d ~ age + (1 + treatment | subject)", "treatment is not a number"),
+        ("R_d ~ exit(age) + (1 | subject)", "has the terms NAME"),
+        ("R_d ~ age + __import__('os').getpid()", "has the terms NAME"),
+        ("R_d ~ {age} + (1 | subject)", "has the terms NAME"),
+        ("R_d ~ age + (1 | subject) ~ visit", "must have one ~"),
+        ("R_d ~ age +* visit + (1 | subject)", "some region must determine it"),
+        ("R_d ~ age", "96 takes of 24 subjects without"),
+        ("R_d ~ C(subject) + (1 | subject)", "do not determine 24 terms"),
+    ],
+)
+def test_linear_model__refuses(formula, said):
+    with pytest.raises(InputError, match=said):
+        linear_model(planted(), formula=formula)
