@@ -12,7 +12,6 @@ import pytest
 
 RUNS = (
     "kill_fit --cases 3 --seed 3",
-    "kill_fit --cases 1 --seed 3 --bucket",
     "kill_withdraw --cases 2",
     "kill_backup --every 90",
     "kill_cluster --cases 1 --seed 3",

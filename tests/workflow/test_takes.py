@@ -35,7 +35,6 @@ from skindb.workflow import (
     simulate,
     traits,
 )
-from skindb.workflow.derive import groups_of
 from skindb.workflow.takes import faults_of
 
 FAULT = Fault("a.exr", "must be readable", "nothing", "write it again")
@@ -401,44 +400,3 @@ def test_map_takes__the_same_bytes_on_every_engine_and_in_any_order(
             _contents(_filled(tmp_path / "cluster", captures[::-1], client=client))
             == expected
         )
-
-
-@pytest.mark.slow
-def test_fit__a_driver_that_is_killed_continues_with_what_is_not_done(
-    captures, address, tmp_path
-):
-    db = skindb.open(str(tmp_path / "db"))
-    ingest_take(db, captures[0], spacing_mm=6.0)
-    capture = db.read("capture", "V001")
-    for take in ("V002", "V003", "V004", "V005", "V006"):
-        with db.stage("capture", take) as stage:
-            stage.write(groups_of(capture))
-            stage.commit(capture.attrs | {"subject": take})
-    command = [
-        sys.executable,
-        "-c",
-        "from skindb.cli import main; main()",
-        "fit",
-        str(db.root),
-        "--k",
-        "2",
-    ]
-    command += ["--scheduler", address, "--json", "--progress", "json"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as driver:
-        assert driver.stderr is not None
-        finished = next(
-            json.loads(line)["take"] for line in driver.stderr if '"finished"' in line
-        )
-        driver.kill()
-    done = {take for take in db.takes("model") if db.history("model", take)}
-    # a worker may still fit a take of the killed driver
-    run = subprocess.run(
-        [*command, "--wait", "60"], capture_output=True, text=True, check=False
-    )
-    assert run.returncode == 0, run.stderr
-    again = json.loads(run.stdout)
-    assert finished in done
-    assert 0 < len(again) <= 6 - len(done)
-    assert not done & set(again)
-    assert db.takes("model") == db.takes("capture")
-    assert len(db.history("model", finished)) == 1

@@ -71,7 +71,7 @@ def test_translucency_grid__shows_the_extremes(db, tmp_path, monkeypatch):
         write(out, rows, names)
 
     monkeypatch.setattr(pictures, "write_grid", keep)
-    monkeypatch.setattr(pictures, "SIDE_PX", 160)
+    monkeypatch.setattr(pictures, "SIDE_PX", 112)
     found = translucency_grid(db, tmp_path / "grid.png", samples=16)
     assert [*found] == ["A", "B"]
     np.testing.assert_allclose([*found.values()], [0.7, 2.0])
