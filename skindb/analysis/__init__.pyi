@@ -39,6 +39,7 @@ from .groups import (
     plot_group_effects,
 )
 from .linear_model import describe_model, linear_model, plot_model
+from .long_form import tidy
 from .maps import (
     describe_effect_maps,
     effect_maps,
@@ -52,7 +53,7 @@ from .registration import (
     register,
     tabulate_registration,
 )
-from .repeatability import (
+from .repeats import (
     describe_repeatability,
     plot_repeatability,
     repeatability,
@@ -71,7 +72,6 @@ from .surface import (
     describe_brdf_space,
     tabulate_brdf_space,
 )
-from .tidy import tidy
 from .traits import plot_traits, trait_vectors
 from .translucency import plot_translucency, translucency_table
 

@@ -16,6 +16,8 @@ from scipy import stats
 from xarray import Dataset
 
 from skindb import plots
+from skindb.analysis.long_form import COLUMNS as VALUES
+from skindb.analysis.long_form import tidy
 from skindb.analysis.quantities import QUANTITIES
 from skindb.analysis.study import (
     Population,
@@ -26,8 +28,6 @@ from skindb.analysis.study import (
     table_of,
 )
 from skindb.analysis.subjects import CONDITION, NORMAL
-from skindb.analysis.tidy import COLUMNS as VALUES
-from skindb.analysis.tidy import tidy
 from skindb.errors import InputError, input_error, require
 from skindb.parameters import option
 from skindb.schema import dataset, variables

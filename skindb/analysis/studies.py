@@ -13,7 +13,7 @@ from skindb.analysis.coverage import STUDY as COVERAGE
 from skindb.analysis.groups import STUDY as GROUPS
 from skindb.analysis.linear_model import STUDY as MODEL
 from skindb.analysis.maps import STUDY as MAPS
-from skindb.analysis.repeatability import STUDY as REPEATABILITY
+from skindb.analysis.repeats import STUDY as REPEATABILITY
 from skindb.analysis.study import Study, Table
 from skindb.analysis.surface import STUDY as SURFACE
 from skindb.analysis.traits import STUDY as TRAITS

@@ -17,6 +17,7 @@ import pandas as pd
 import xarray as xr
 from dask.delayed import Delayed, delayed
 
+from skindb.analysis.long_form import tidy
 from skindb.analysis.regions import common_landmarks
 from skindb.analysis.registration import describe_registration
 from skindb.analysis.studies import STUDIES
@@ -27,7 +28,6 @@ from skindb.analysis.subjects import (
     subjects_of,
     subjects_without_normal,
 )
-from skindb.analysis.tidy import tidy
 from skindb.errors import InputError, input_error, require
 from skindb.format.dome import EXPOSURE_RATIO
 from skindb.parameters import option_of, require_limits
