@@ -33,12 +33,12 @@ from .correlations import (
 from .coverage import coverage_report, describe_coverage, plot_coverage
 from .detail import transfer_detail
 from .edit import apply_traits, describe_edit
+from .formula_models import describe_model, linear_model, plot_model
 from .groups import (
     describe_group_effects,
     group_effects,
     plot_group_effects,
 )
-from .linear_model import describe_model, linear_model, plot_model
 from .long_form import tidy
 from .maps import (
     describe_effect_maps,

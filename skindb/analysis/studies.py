@@ -10,8 +10,8 @@ from skindb.analysis.chromophores import STUDY as CHROMOPHORES
 from skindb.analysis.components import STUDY as COMPONENTS
 from skindb.analysis.correlations import STUDY as CORRELATIONS
 from skindb.analysis.coverage import STUDY as COVERAGE
+from skindb.analysis.formula_models import STUDY as MODEL
 from skindb.analysis.groups import STUDY as GROUPS
-from skindb.analysis.linear_model import STUDY as MODEL
 from skindb.analysis.maps import STUDY as MAPS
 from skindb.analysis.repeats import STUDY as REPEATABILITY
 from skindb.analysis.study import Study, Table

@@ -12,7 +12,7 @@ from planted_tables import planted_tables
 from scipy import stats
 
 from skindb.analysis import linear_model, tidy
-from skindb.analysis.linear_model import MixedModel, _fit
+from skindb.analysis.formula_models import MixedModel, _fit
 from skindb.errors import InputError
 
 PEOPLE, VISITS = 24, 4
