@@ -68,6 +68,9 @@ class Contrast:
     is_number: bool = False  # whether the compared attribute is numeric
     # (n, q) values in the condition normal, for differences within subjects
     before: Array | None = None
+    reliability: Array | None = (
+        None  # (q,) of the subjects, see `Quantities.reliability`
+    )
 
     @property
     def is_paired(self) -> bool:
@@ -120,8 +123,16 @@ def contrasts(
     else:
         regressors = _regressors(attribute, group_by)
     is_number = group_by in everyone.attributes and attribute.is_numeric
+    reliability = quantities.reliability
     return [
-        Contrast(name, quantities, regressor, covariates, is_number).complete()
+        Contrast(
+            name,
+            quantities,
+            regressor,
+            covariates,
+            is_number,
+            reliability=reliability,
+        ).complete()
         for name, regressor in regressors.items()
     ]
 
@@ -244,12 +255,22 @@ def _paired(
         if not both:
             continue
         after = changed.of_subjects(both)
-        before = plain.of_subjects(both).values
+        normal = plain.of_subjects(both)
+        before = normal.values
         difference = replace(after, values=after.values - before)
         ones = np.ones(len(both))
         nothing = np.empty((len(both), 0))
         title = f"{name} less {NORMAL}"
-        pairs.append(Contrast(title, difference, ones, nothing, before=before))
+        pairs.append(
+            Contrast(
+                title,
+                difference,
+                ones,
+                nothing,
+                before=before,
+                reliability=normal.reliability,
+            )
+        )
     require(
         pairs,
         f"group by {group_by}",

@@ -42,6 +42,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SIGNIFICANT = 0.05  # of adjusted p values
+# below which a quantity shows errors more than subjects ("poor" in Koo and Li 2016), and
+# has no p values
+MIN_RELIABILITY = 0.5
 MAX_LISTED = 6  # detectable differences that are named in a line
 SIDES = ("with", "without")
 COLUMNS = (
@@ -51,6 +54,7 @@ COLUMNS = (
     variables.EFFECT_PERCENT,
     variables.EFFECT_PERCENT_LOW,
     variables.EFFECT_PERCENT_HIGH,
+    variables.EFFECT_RELIABILITY,
     variables.EFFECT_P,
     variables.EFFECT_P_ADJUSTED,
     variables.EFFECT_P_FALSE_DISCOVERY,
@@ -95,11 +99,13 @@ def group_effects(
         (contrast, quantity), see the variables of the group "effects": effect with HC3
         interval, also in per cent and in standard deviations; p values (unadjusted,
         adjusted by the largest statistic, and by the false discovery rate); and the
-        smallest detectable effect. sigma_tr is compared by its logarithm. NaN where too
-        few subjects have a quantity. R_d may be wrong by the same amount in all takes
-        (even reflection): this cancels in differences, and the intervals in per cent
-        include it. Attribute "flags": small or missing groups,
-        and confounded attributes.
+        smallest detectable effect; and the reliability, the fraction of the variance
+        between subjects that the errors of the fits and the differences between
+        repeated takes leave: where it is below 0.5, there are no p values. sigma_tr is
+        compared by its logarithm. NaN where too few subjects have a quantity. R_d may
+        be wrong by the same amount in all takes (even reflection): this cancels in
+        differences, and the intervals in per cent include it. Attribute "flags": small
+        or missing groups, confounded attributes, and low reliability.
 
     Raises
     ------
@@ -155,7 +161,9 @@ def _statistics(comparison: Comparison) -> dict[str, Array]:
     contrast = comparison.contrast
     test = comparison.test
     fit = test.effects
-    p = test.p
+    assert contrast.reliability is not None
+    is_low = contrast.reliability < MIN_RELIABILITY
+    p, p_adjusted = (np.where(is_low, np.nan, x) for x in (test.p, test.p_adjusted))
     percent, low, high = _percent(fit, _reference(contrast, fit), contrast.quantities)
     discovered = np.full(len(p), np.nan)
     discovered[np.isfinite(p)] = stats.false_discovery_control(p[np.isfinite(p)])
@@ -175,9 +183,10 @@ def _statistics(comparison: Comparison) -> dict[str, Array]:
         variables.EFFECT_PERCENT_HIGH: high,
         variables.EFFECT_STANDARDISED: standardised,
         variables.EFFECT_P: p,
-        variables.EFFECT_P_ADJUSTED: test.p_adjusted,
+        variables.EFFECT_P_ADJUSTED: p_adjusted,
         variables.EFFECT_P_FALSE_DISCOVERY: discovered,
         variables.EFFECT_DETECTABLE: detectable,
+        variables.EFFECT_RELIABILITY: contrast.reliability,
         variables.ATTRIBUTE_ASSOCIATION: np.array(list(comparison.associated.values())),
     }
 
@@ -242,6 +251,17 @@ def _flags(comparison: Comparison, statistics: dict[str, Array]) -> list[str]:
     """Warnings about a comparison and the significance that it can reach."""
     contrast = comparison.contrast
     flags = comparison.flags + _surface_flag(contrast, statistics)
+    reliability = statistics[variables.EFFECT_RELIABILITY]
+    names = contrast.quantities.names
+    if low := [
+        f"{name} {value:.2f}"
+        for name, value in zip(names, reliability, strict=True)
+        if value < MIN_RELIABILITY
+    ]:
+        flags.append(
+            f"{contrast.name}: no p values where the reliability is below "
+            f"{MIN_RELIABILITY}: {', '.join(low)}"
+        )
     smallest = _smallest_p(comparison)
     if smallest >= SIGNIFICANT:
         flags.append(

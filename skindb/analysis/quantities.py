@@ -20,12 +20,13 @@ from skindb.analysis.colour import (
 )
 from skindb.analysis.subjects import LEVEL, level_error
 from skindb.errors import Fault, InputError, require
-from skindb.numerics.statistics import known_mean
+from skindb.numerics.statistics import Moments, known_mean
 from skindb.schema import IDENTIFIED, ProbeStatus, variables
 from skindb.schema.label import CHANNELS
-from skindb.types import AnyArray, Array, Index, float64
+from skindb.types import AnyArray, Array, Index, Mask, float64
 
 NORMAL_95 = 1.96
+MIN_SUBJECTS = 3  # for a variance between or within subjects
 SURFACE = "surface reflectance"
 TYPOLOGY_ANGLE = "ITA"
 COLOUR_DIFFERENCE = "delta E"
@@ -152,8 +153,28 @@ class Quantities:
         values = np.stack([known_mean(self.values[rows]) for rows in takes])
         errors = None
         if self.errors is not None:
+            count = np.stack(
+                [np.isfinite(self.values[rows]).sum(axis=0) for rows in takes]
+            )
+            repeated = _within_deviation(self.values, takes) / np.sqrt(
+                np.maximum(count, 1)
+            )
             errors = np.stack([_mean_error(self.errors[rows]) for rows in takes])
+            errors = np.fmax(errors, repeated)
         return replace(self, values=values, subject=names, errors=errors)
+
+    @property
+    def reliability(self) -> Array:
+        """Fraction (q,) of the variance between these subjects that their errors leave;
+        NaN without errors or for fewer than three subjects.
+        """
+        if self.errors is None:
+            return np.full(self.values.shape[1], np.nan)
+        moments = Moments.of(self.values)
+        error = known_mean(np.where(np.isfinite(self.values), self.errors, np.nan) ** 2)
+        is_known = (moments.count >= MIN_SUBJECTS) & (moments.variance > 0)
+        fraction = 1 - error / np.where(is_known, moments.variance, np.nan)
+        return np.maximum(fraction, 0.0)
 
     def select(self, rows: Sequence[int] | Index) -> Quantities:
         """The quantities of the takes or subjects with these indices."""
@@ -166,6 +187,18 @@ def _mean_error(errors: Array) -> Array:
     """Standard error of the mean of values with independent errors (n, ...)."""
     count = np.isfinite(errors).sum(axis=0)
     return np.asarray(np.sqrt(known_mean(errors**2) / np.maximum(count, 1)))
+
+
+def _within_deviation(values: Array, takes: Sequence[Mask]) -> Array:
+    """Standard deviation (q,) of the takes of one subject, from values (n, q); NaN where
+    fewer than three subjects have two.
+    """
+    of_subjects = [Moments.of(values[rows]) for rows in takes]
+    second = sum(moments.second for moments in of_subjects)
+    free = sum(np.maximum(moments.count - 1, 0) for moments in of_subjects)
+    repeated = sum(moments.count > 1 for moments in of_subjects)
+    variance = second / np.maximum(free, 1)
+    return np.asarray(np.where(repeated >= MIN_SUBJECTS, np.sqrt(variance), np.nan))
 
 
 def trusted(takes: Dataset, variable: str) -> DataArray:

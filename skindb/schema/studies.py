@@ -308,6 +308,11 @@ EFFECT_DETECTABLE = declare(
     "float64 effects/effect_detectable(contrast, quantity) [1]",
     "smallest effect that a test at 5 % finds with a probability of 80 %",
 )
+EFFECT_RELIABILITY = declare(
+    "float64 effects/effect_reliability(contrast, quantity) [1]",
+    "fraction of the variance between subjects that the errors of the fits and repeated takes "
+    "leave; of the takes in the condition normal where conditions are compared",
+)
 ATTRIBUTE_ASSOCIATION = declare(
     "float64 effects/attribute_association(contrast, attribute) [1]",
     "multiple correlation of what is compared with another attribute, adjusted for the "

@@ -316,3 +316,70 @@ def test_plot_group_effects__has_a_row_for_each_quantity(tmp_path):
     assert len(ax.get_yticklabels()) == table.sizes["quantity"]
     assert "(n = 50)" in ax.get_legend().get_texts()[0].get_text()
     ax.figure.savefig(tmp_path / "a.png", dpi=100, bbox_inches="tight")
+
+
+def _repeated(stated: float, repeat: float, between: float = 0.002):
+    """200 subjects at three visits; surface reflectance varies by `between` between and by
+    `repeat` within subjects, and its stated error is `stated`.
+    """
+    rng = np.random.default_rng(6)
+    names = np.repeat([f"S{i:03d}" for i in range(200)], 3)
+    cohort = planted_tables(names.tolist(), gender=np.repeat(["f", "m"], 300))
+    surface = 0.03 + np.repeat(rng.normal(0, between, (200, 2)), 3, axis=0)
+    surface += rng.normal(0, repeat, surface.shape)
+    dims = ("take", "region")
+    return cohort.assign(
+        region_surface_reflectance=(dims, surface),
+        region_surface_reflectance_error=(dims, np.full(surface.shape, stated)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("stated", "repeat", "reliability"),
+    [
+        # stated errors that are too small: those of the repeats count, over three visits
+        (0.0002, 0.002, 0.75),
+        # where repeats agree, stated errors count, over three visits
+        (0.002, 0.0, 1 - 1 / 3),
+        (0.0002, 0.008, 1 / (1 + 16 / 3)),
+    ],
+)
+def test_group_effects__reliability_is_what_was_planted(stated, repeat, reliability):
+    """A variance of 200 subjects has a standard error of 10 %, and so has the fraction
+    that it leaves; three of them are allowed.
+    """
+    effects = group_effects(
+        _repeated(stated, repeat),
+        group_by="gender",
+        permutations=200,
+        rng=np.random.default_rng(0),
+    ).isel(contrast=0)
+    name = "surface reflectance face"
+    estimated = float(effects["effect_reliability"].sel(quantity=name))
+    assert estimated == pytest.approx(reliability, abs=0.3 * (1 - reliability))
+    is_withheld = bool(np.isnan(effects["effect_p_adjusted"].sel(quantity=name)))
+    assert is_withheld == (reliability < 0.5)
+    flags = " ".join(effects.attrs["flags"])
+    assert (
+        "no p values where the reliability is below 0.5: surface" in flags
+    ) == is_withheld
+    assert np.isfinite(effects["effect_p"].sel(quantity="R_d face R"))
+
+
+def test_group_effects__reliability_of_conditions_is_that_of_normal_takes():
+    names = [f"S{i}" for i in range(30)]
+    cohort = planted_tables(names * 2, conditions=["normal"] * 30 + ["lotion"] * 30)
+    dims = ("take", "region", "channel")
+    error = np.full(cohort["region_diffuse_reflectance"].shape, 0.015)
+    cohort = cohort.assign(region_diffuse_reflectance_error=(dims, error))
+    effects = group_effects(
+        cohort, group_by="condition", permutations=200, rng=np.random.default_rng(0)
+    ).isel(contrast=0)
+    normal = cohort["region_diffuse_reflectance"].values[:30, 0, 1]
+    expected = 1 - 0.015**2 / normal.var(ddof=1)
+    reliability = effects["effect_reliability"].sel(quantity="R_d face G")
+    assert float(reliability) == pytest.approx(expected)
+    # without stated errors it is unknown, and p values remain
+    name = "surface reflectance face"
+    assert np.isnan(effects["effect_reliability"].sel(quantity=name))
+    assert np.isfinite(effects["effect_p"].sel(quantity=name))
