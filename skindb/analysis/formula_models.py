@@ -18,7 +18,7 @@ from xarray import Dataset
 from skindb import plots
 from skindb.analysis.long_form import COLUMNS as VALUES
 from skindb.analysis.long_form import tidy
-from skindb.analysis.quantities import QUANTITIES
+from skindb.analysis.quantities import COLOUR_DIFFERENCE, QUANTITIES
 from skindb.analysis.study import (
     Population,
     Results,
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 SUBJECT = "subject"
 RESIDUAL = "residual"
+MODELLED = (*QUANTITIES, COLOUR_DIFFERENCE)
 INTERCEPT = "Intercept"
 EXAMPLE = "write, for example: ITA ~ treatment * visit + age + (1 | subject)"
 # what a formula may consist of: formulaic would evaluate any Python expression
@@ -81,8 +82,7 @@ class MixedModel:
         faults = {
             "must have one ~ between a quantity and terms": not separator
             or "~" in right,
-            f"must begin with one of {', '.join(QUANTITIES)}": quantity
-            not in QUANTITIES,
+            f"must begin with one of {', '.join(MODELLED)}": quantity not in MODELLED,
             "has at most one random part, (1 | subject) or (1 + NAME | subject)": len(
                 random
             )

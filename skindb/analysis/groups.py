@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING
@@ -13,6 +14,7 @@ from scipy.special import gammaln
 from xarray import Dataset
 
 from skindb import plots
+from skindb.analysis.colour import colour_difference
 from skindb.analysis.contrasts import (
     Comparison,
     Contrast,
@@ -36,6 +38,7 @@ from skindb.numerics.statistics import detectable_difference, known_mean
 from skindb.parameters import ContrastParameters
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
+from skindb.schema.label import CHANNELS
 from skindb.types import Array
 
 if TYPE_CHECKING:
@@ -251,6 +254,7 @@ def _flags(comparison: Comparison, statistics: dict[str, Array]) -> list[str]:
     """Warnings about a comparison and the significance that it can reach."""
     contrast = comparison.contrast
     flags = comparison.flags + _surface_flag(contrast, statistics)
+    flags += _colour_flag(contrast)
     reliability = statistics[variables.EFFECT_RELIABILITY]
     names = contrast.quantities.names
     if low := [
@@ -269,6 +273,28 @@ def _flags(comparison: Comparison, statistics: dict[str, Array]) -> list[str]:
             f"below {smallest:.2g}, so that no difference can be significant at 5 %"
         )
     return flags
+
+
+def _colour_flag(contrast: Contrast) -> list[str]:
+    """Mean differences of colour of the regions, where conditions are compared."""
+    if contrast.before is None:
+        return []
+    names = contrast.quantities.names
+    differences = []
+    for region in (name[4:-2] for name in names if re.fullmatch("R_d .* R", name)):
+        channels = [f"R_d {region} {channel}" for channel in CHANNELS]
+        if {*channels} <= {*names}:
+            columns = [names.index(channel) for channel in channels]
+            before = contrast.before[:, columns]
+            change = contrast.quantities.values[:, columns]
+            mean = float(known_mean(colour_difference(before + change, before)))
+            differences.append(f"{region} {mean:.2g}")
+    if not differences:
+        return []
+    return [
+        f"{contrast.name}: mean delta E (CIEDE2000), which noise makes larger: "
+        + ", ".join(differences)
+    ]
 
 
 def _surface_flag(contrast: Contrast, statistics: dict[str, Array]) -> list[str]:

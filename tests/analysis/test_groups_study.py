@@ -7,7 +7,12 @@ import pytest
 from planted_tables import planted_tables
 from scipy import stats
 
-from skindb.analysis import describe_group_effects, group_effects, plot_group_effects
+from skindb.analysis import (
+    describe_group_effects,
+    group_effects,
+    plot_group_effects,
+    tidy,
+)
 from skindb.errors import InputError
 
 FACE_R = "R_d face R"
@@ -366,7 +371,7 @@ def test_group_effects__reliability_is_what_was_planted(stated, repeat, reliabil
     assert np.isfinite(effects["effect_p"].sel(quantity="R_d face R"))
 
 
-def test_group_effects__reliability_of_conditions_is_that_of_normal_takes():
+def test_group_effects__reliability_and_colour_of_conditions():
     names = [f"S{i}" for i in range(30)]
     cohort = planted_tables(names * 2, conditions=["normal"] * 30 + ["lotion"] * 30)
     dims = ("take", "region", "channel")
@@ -374,7 +379,12 @@ def test_group_effects__reliability_of_conditions_is_that_of_normal_takes():
     cohort = cohort.assign(region_diffuse_reflectance_error=(dims, error))
     effects = group_effects(
         cohort, group_by="condition", permutations=200, rng=np.random.default_rng(0)
-    ).isel(contrast=0)
+    )
+    rows = tidy(cohort.assign_coords(take=[*names, *(f"{s}.lotion" for s in names)]))
+    means = rows[rows.quantity == "delta E"].groupby("region").value.mean()
+    said = f"larger: face {means.face:.2g}, beard {means.beard:.2g}"
+    assert any(flag.endswith(said) for flag in effects.attrs["flags"])
+    effects = effects.isel(contrast=0)
     normal = cohort["region_diffuse_reflectance"].values[:30, 0, 1]
     expected = 1 - 0.015**2 / normal.var(ddof=1)
     reliability = effects["effect_reliability"].sel(quantity="R_d face G")

@@ -126,6 +126,13 @@ def test_linear_model__without_a_random_part_is_least_squares():
     np.testing.assert_allclose(ours["model_p"], theirs.pvalues[terms])
 
 
+def test_linear_model__of_colour_differences():
+    """The first visit is the baseline, and no row."""
+    table = linear_model(planted(), formula="delta E ~ visit + (1 | subject)")
+    assert table["quantity"].values.tolist() == ["delta E face", "delta E beard"]
+    assert (table["model_takes"] == PEOPLE * (VISITS - 1)).all()
+
+
 def test_linear_model__no_variance_between_subjects_is_flagged():
     """The residuals are as large within as between subjects by construction."""
     cohort = planted()
