@@ -77,7 +77,7 @@ SCAN_REGIONS = ("forehead", "nose", "cheek", "lips", "chin", "neck", "beard")
 
 def session_time(person: Person) -> datetime:
     """A fixed time that depends only on the person, the condition and the visit."""
-    days = person.seed % 365 + 28 * (person.visit - 1)
+    days = person.seed % 365 + 28 * ((person.visit or 1) - 1)
     minutes = 40 * CONDITIONS.index(person.condition)
     return datetime(2005, 1, 10, 9, 0, tzinfo=UTC) + timedelta(
         days=days, minutes=minutes
@@ -95,8 +95,8 @@ def capture_record(person: Person, *, contact: bool, landmarks: bool) -> dict[st
     }
     record = {
         "format": "skindb-capture",
-        "version": 1 if person.visit == 1 else 2,
-        **({} if person.visit == 1 else {"visit": person.visit}),
+        "version": 2 if person.visit else 1,
+        **({"visit": person.visit} if person.visit else {}),
         "subject": person.subject,
         "session": session_time(person).isoformat(),
         "condition": person.condition,

@@ -46,7 +46,7 @@ class Person:
     melanin: float = 0.0  # standard deviations from the mean of the group
     blood: float = 0.0  # standard deviations
     fullness: float = 0.5  # of the cheeks, 0 to 1
-    visit: int = 1
+    visit: int | None = None  # None if there is only one
 
     def __post_init__(self) -> None:
         for value, allowed, name in (
@@ -62,7 +62,7 @@ class Person:
     @property
     def take(self) -> str:
         """Name of this take."""
-        return take_name(self.subject, self.condition, self.visit)
+        return take_name(self.subject, self.condition, self.visit or 1)
 
     def stream(self, purpose: int) -> np.random.Generator:
         """Random generator for this person, independent of the condition, with one

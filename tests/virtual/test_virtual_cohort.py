@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from skindb.errors import InputError
-from skindb.virtual.capture import session_time
+from skindb.virtual.capture import capture_record, session_time
 from skindb.virtual.person import VISIT_BLOOD, VISIT_MELANIN, cohort_people
 from skindb.workflow import simulate
 
@@ -54,6 +54,10 @@ def test_cohort_people__visits_vary_as_stated():
     first = normal[:3]
     assert [one.take for one in first] == ["P001", "P001.normal.2", "P001.normal.3"]
     assert len({session_time(one) for one in people if one.subject == "P001"}) == 6
+    stated = [capture_record(one, contact=True, landmarks=True) for one in first]
+    assert [record["visit"] for record in stated] == [1, 2, 3]
+    alone = capture_record(cohort_people(1)[0], contact=True, landmarks=True)
+    assert (alone["version"], "visit" in alone) == (1, False)
     of_day = {(one.subject, one.visit): one.melanin for one in normal}
     for one in people:
         if one.condition == "lotion" and (one.subject, one.visit) in of_day:
