@@ -29,13 +29,7 @@ from skindb.format.fields import (
 )
 from skindb.format.frames import decoding_faults, inside
 from skindb.format.scan_checks import (
-    CAMERAS,
-    LANDMARKS,
-    LIGHTS,
-    SCAN,
     SITE_LANDMARK,
-    SIZES,
-    Lengths,
     coincidence_faults,
     crop_path,
     device_faults,
@@ -44,12 +38,10 @@ from skindb.format.scan_checks import (
     face_faults,
     face_height,
     landmark_faults,
-    likely_units,
     order_faults,
     parsed_crop,
     scan_faults,
     swapped_faults,
-    unit_text,
 )
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.geometry.scan import Crop, Scan, crop_faces, read_scan
@@ -208,9 +200,7 @@ class _Reader:
         if probe is not None:
             self.probe = read_probe(self.folder, probe)
         self._require_sites(landmarks, regions)
-        if self.unit_faults and scan is not None:
-            lengths = Lengths(scan, landmarks, _middles(scan, regions), self.dome)
-            self.faults += self._joint_unit_fault(lengths) or self.unit_faults
+        self.faults += self.unit_faults
         if not fields.has("mesh"):
             self._require_one_camera()
             scan, surface = NO_SCAN, NO_SURFACE
@@ -476,7 +466,7 @@ class _Reader:
         """Record the first kind of fault that landmarks have."""
         distant = landmark_faults(where, points, scan)
         if len(distant) > max(2, len(points) / 2):
-            self.unit_faults += distant
+            self.unit_faults += face_faults(where, points, on_scan=False) or distant
             return
         faults = (
             distant
@@ -495,27 +485,6 @@ class _Reader:
         self.unit_faults += faults
         self.sized = not faults and face_height(points) is not None
         return faults
-
-    def _joint_unit_fault(self, lengths: Lengths) -> list[Fault]:
-        """One fault for all parts in other units than mm; none if no units explain the lengths."""
-        units = likely_units(lengths)
-        if not units:
-            return []
-        dome = str(self.folder / str(self.fields.get("dome", "")))
-        files = {
-            SCAN: self.mesh_place,
-            LANDMARKS: str(self.folder / str(self.fields.get("landmarks", ""))),
-            CAMERAS: dome,
-            LIGHTS: dome,
-        }
-        places = ", ".join(dict.fromkeys(files[part] for part in units))
-        sizes = lengths.sizes
-        finding = ", ".join(
-            f"{words} {sizes[part]:.3g}"
-            for part, words in SIZES.items()
-            if part in sizes
-        )
-        return [Fault(places, "all lengths must be in mm", finding, unit_text(units))]
 
     def _regions(
         self, scan: Scan | None, surface: CleanMesh | None

@@ -1,13 +1,9 @@
 """Sanity checks of scans, landmarks and lengths: whether all are in mm and in one frame,
-the likely units of parts that are not, exchanged left and right; the file beside the
+the likely unit of a part that is not, exchanged left and right; the file beside the
 landmarks that holds the box by which the scan is cropped.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
-from itertools import product
-from math import inf, log
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -66,31 +62,8 @@ MIN_LANDMARK_DISTANCE_MM = 0.5
 # to the subject's left, for a pair to be checked: 60 degrees allow for asymmetry
 MIN_COSINE_SIDEWAYS = 0.5
 MAX_COORDINATE_MM = 1e30  # smaller than infinity in single precision
-SCAN = "scan"
-LANDMARKS = "landmarks"
-CAMERAS = "cameras"
-LIGHTS = "lights"
-SIZES = {
-    SCAN: "diagonal of the scan",
-    LANDMARKS: "face from eyes to mouth",
-    CAMERAS: "cameras at",
-    LIGHTS: "lights at",
-}
-LENGTHS = {
-    SCAN: "the vertices of the scan",
-    LANDMARKS: "the landmarks",
-    CAMERAS: "t of the cameras",
-    LIGHTS: "position of the lights",
-}
-MM = {"millimetres": 1.0, **UNITS}  # mm of each
 # mm from the origin: 100 m; domes have a radius of 0.5 to 5 m
 MAX_DEVICE_DISTANCE_MM = 100_000.0
-# distance of the lights over the diagonal of a head; below it they are inside
-MIN_LIGHT_RATIO = 0.6
-# logarithm of a factor, of lengths that are as far from the usual ones as one more
-# part, or one more unit, is unlikely
-PART_COST = UNIT_COST = 0.7
-MAX_VERTICES = 5_000  # of a scan, for its span in the pictures
 # of a point inside; outside the convex hull of a surface it is at most 0.5
 MIN_WINDING_NUMBER = 0.5
 # of the longest side of a picture. Heads in a dome span 0.7 to 1; ten times too far
@@ -126,21 +99,24 @@ def scan_faults(where: str, surface: CleanMesh) -> list[Fault]:
     ]
 
 
-def face_faults(where: str, points: Mapping[str, Float64]) -> list[Fault]:
+def face_faults(
+    where: str, points: Mapping[str, Float64], *, on_scan: bool = True
+) -> list[Fault]:
     """Fault of a face that is too large or too small to be in mm, by its landmarks or
-    the centres of its regions.
+    the centres of its regions, which may lie on the scan, so that it has their unit.
     """
     height = face_height(points)
     smallest, largest = FACE_HEIGHTS
     if height is None or smallest <= height <= largest:
         return []
+    cure = rescaling(likely_unit(height, FACE_HEIGHT))
     return [
         Fault(
             where,
             f"lengths must be in mm, and a face must be {smallest:g} to {largest:g} mm from "
             "brows and eyes to mouth and chin",
             f"{height:.3g} mm",
-            f"{rescaling(likely_unit(height, FACE_HEIGHT))}, also for the scan",
+            f"{cure}, also for the scan" if on_scan else cure,
         )
     ]
 
@@ -158,8 +134,9 @@ def landmark_faults(
 ) -> list[Fault]:
     """Faults of landmarks that are not on the scan."""
     rule = f"a landmark must lie within {LANDMARK_REACH:g} mm of the scan"
+    cure = "mark it again, with scan and landmarks in mm and in one frame"
     return [
-        Fault(f"{where}[{name}]", rule, f"{d:.1f} mm away", "mark it again, in mm")
+        Fault(f"{where}[{name}]", rule, f"{d:.1f} mm away", cure)
         for name, d in _distances(points, scan).items()
         if d > LANDMARK_REACH
     ]
@@ -301,13 +278,10 @@ def likely_unit(length: float, usual: float) -> str:
     return min(UNITS, key=distance)
 
 
-def rescaling(unit: str, lengths: str = "") -> str:
+def rescaling(unit: str) -> str:
     """The correction for lengths in a wrong unit, for a message."""
     factor = UNITS[unit]
-    words = f" {lengths}" if lengths else ""
-    cure = f"multiply{words} by {factor:g}"
-    if factor < 1:
-        cure = f"divide{words} by {1 / factor:g}"
+    cure = f"divide by {1 / factor:g}" if factor < 1 else f"multiply by {factor:g}"
     return f"these look like {unit}: {cure}"
 
 
@@ -346,138 +320,10 @@ def is_point(value: Any) -> bool:
     )
 
 
-@dataclass(frozen=True)
-class Lengths:
-    """Parts of a capture, as far as they are known; `middles` are the centres of named
-    regions of the scan.
-    """
-
-    scan: Scan
-    landmarks: Mapping[str, Float64]
-    middles: Mapping[str, Float64]
-    dome: DomeRecord | None
-
-    @cached_property
-    def sizes(self) -> dict[str, float]:
-        """A length of each part: diagonal, height of the face, median distances from
-        the centre of the scan.
-        """
-        vertices = self.scan.vertices
-        sizes = {SCAN: float(np.linalg.norm(np.ptp(vertices, axis=0)))}
-        if (height := face_height(self.landmarks)) is not None:
-            sizes[LANDMARKS] = height
-        if self.dome is not None and self.dome.cameras:
-            sizes[CAMERAS] = self.distance([c.centre for c in self.dome.cameras])
-        if self.dome is not None and self.dome.lights:
-            sizes[LIGHTS] = self.distance([x.position for x in self.dome.lights])
-        return sizes
-
-    def distance(self, positions: list[Float64], factor: float = 1.0) -> float:
-        """Median distance from the centre of the scan of positions times a factor."""
-        away = factor * np.array(positions) - self.scan.vertices.mean(axis=0)
-        return float(np.median(np.linalg.norm(away, axis=1)))
-
-
-def likely_units(lengths: Lengths) -> dict[str, str]:
-    """The unit of each part that is not in mm; empty if all of them may be, or if no
-    units make a capture of a head.
-
-    Of all combinations, the one is chosen in which lengths are closest to those of
-    heads in domes, and in which the fewest parts are in the fewest other units.
-    """
-    parts = [*lengths.sizes]
-    ratios = {a / b for a, b in product(MM.values(), repeat=2)}
-    near = {}
-    if LANDMARKS in parts:
-        near = {ratio: _landmark_distance(lengths, ratio) for ratio in ratios}
-    views = {ratio: _device_costs(lengths, ratio) for ratio in ratios}
-    best = dict[str, str]()
-    lowest = inf
-    for names in product(MM, repeat=len(parts)):
-        units = dict(zip(parts, names, strict=True))
-        other_units = {part: unit for part, unit in units.items() if MM[unit] != 1}
-        cost = PART_COST * len(other_units) + UNIT_COST * max(len({*names}) - 1, 0)
-        if cost < lowest:
-            factors = {part: MM[unit] for part, unit in units.items()}
-            cost += _cost(lengths, factors, near, views)
-        if cost < lowest:
-            best = other_units
-            lowest = cost
-    return best
-
-
-def _cost(
-    lengths: Lengths,
-    factor: Mapping[str, float],
-    near: Mapping[float, float],
-    views: Mapping[float, Mapping[str, float]],
-) -> float:
-    """Sum of the logarithms by which lengths differ from the usual ones; infinite for
-    lengths that are impossible.
-    """
-    sizes = {part: factor[part] * size for part, size in lengths.sizes.items()}
-    diagonal = sizes[SCAN]
-    height = sizes.get(LANDMARKS, (face_height(lengths.middles) or 0.0) * factor[SCAN])
-    if not SCAN_DIAGONAL[0] <= diagonal <= SCAN_DIAGONAL[1]:
-        return inf
-    cost = abs(log(diagonal / HEAD_DIAGONAL))
-    if height:
-        if not FACE_HEIGHTS[0] <= height <= FACE_HEIGHTS[1]:
-            return inf
-        cost = abs(log(height / FACE_HEIGHT))
-    if LANDMARKS in factor:
-        reach = LANDMARK_REACH / factor[SCAN]
-        if min(near.values()) < reach < near[factor[LANDMARKS] / factor[SCAN]]:
-            return inf
-    for part in (CAMERAS, LIGHTS):
-        if part in factor:
-            cost += views[factor[part] / factor[SCAN]][part]
-    return cost
-
-
-def _landmark_distance(lengths: Lengths, ratio: float) -> float:
-    """Median distance of the landmarks from the scan, in its unit, if they are this
-    many times larger.
-    """
-    points = ratio * np.array([*lengths.landmarks.values()])
-    distances = closest_on_mesh(lengths.scan.vertices, lengths.scan.faces, points)[2]
-    return float(np.median(distances))
-
-
-def _device_costs(lengths: Lengths, ratio: float) -> dict[str, float]:
-    """Costs of cameras and lights that are this many times farther away, in the unit of
-    the scan.
-    """
-    dome = lengths.dome
-    if dome is None:
-        return {}
-    vertices = lengths.scan.vertices[:: -(-len(lengths.scan.vertices) // MAX_VERTICES)]
-    spans = [picture_span(camera, vertices, factor=ratio) for camera in dome.cameras]
-    finite = [span for span in spans if span is not None and np.isfinite(span)]
-    camera_cost = inf
-    if 2 * len(finite) >= len(spans):
-        camera_cost = abs(log(float(np.median(finite)) / USUAL_SPAN))
-    positions = [light.position for light in dome.lights]
-    far = lengths.distance(positions, ratio) / lengths.sizes[SCAN]
-    light_cost = abs(log(far / DOME_RADIUS_RATIO)) if far >= MIN_LIGHT_RATIO else inf
-    return {CAMERAS: camera_cost, LIGHTS: light_cost}
-
-
-def unit_text(units: Mapping[str, str]) -> str:
-    """The correction for parts in other units, for a message."""
-    cures = list[str]()
-    for unit in dict.fromkeys(units.values()):
-        *before, final = (LENGTHS[part] for part in units if units[part] == unit)
-        lengths = f"{', '.join(before)} and {final}" if before else final
-        cures.append(rescaling(unit, lengths))
-    if not {CAMERAS, LIGHTS}.isdisjoint(units):
-        cures.append("check disc_radius and the white target too")
-    return "; ".join(cures)
-
-
 def device_faults(where: str, dome: DomeRecord, surface: CleanMesh) -> list[Fault]:
     """Faults of cameras and lights that are inside the head, or too far away."""
     faults = []
+    diagonal = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
     for key, positions in (
         ("cameras", {camera.id: camera.centre for camera in dome.cameras}),
         ("lights", {light.id: light.position for light in dome.lights}),
@@ -500,19 +346,22 @@ def device_faults(where: str, dome: DomeRecord, surface: CleanMesh) -> list[Faul
                 Fault(f"{where}[{key}]", rule, finding, "give positions in mm")
             )
         if inner:
+            cure = "calibrate in mm and in the frame of the scan; a camera is at -R^T t"
+            if len(inner) == len(positions):
+                cure = f"{_dome_rescaling([*positions.values()], diagonal)}, or {cure}"
             rule = f"{key} must be outside the head"
             finding = (
                 f"{len(inner)} of {len(positions)} inside it: {_first_names(inner)}"
             )
-            faults.append(
-                Fault(
-                    f"{where}[{key}]",
-                    rule,
-                    finding,
-                    "calibrate in mm and in the frame of the scan; a camera is at -R^T t",
-                )
-            )
+            faults.append(Fault(f"{where}[{key}]", rule, finding, cure))
     return faults
+
+
+def _dome_rescaling(positions: Sequence[Float64] | Float64, diagonal: float) -> str:
+    """The correction for positions of cameras or lights around a scan of this diagonal [mm]."""
+    # the origin is near the centre of the dome
+    distance = float(np.median(np.linalg.norm(positions, axis=1)))
+    return rescaling(likely_unit(distance, DOME_RADIUS_RATIO * diagonal))
 
 
 def _first_names(names: list[str]) -> str:
@@ -547,15 +396,12 @@ def dome_unit_faults(
         [*(c.centre for c in dome.cameras), *(x.position for x in dome.lights)]
     )
     if ((positions > low) & (positions < high)).all():
-        # the origin is near the centre of the dome
-        distance = float(np.median(np.linalg.norm(positions, axis=1)))
-        unit = likely_unit(distance, DOME_RADIUS_RATIO * diagonal)
         return [
             Fault(
                 where,
                 "lengths must be in mm, and a dome must surround the scan",
                 "all of it within the bounding box of the scan",
-                f"{rescaling(unit)}, or calibrate in the frame of the scan",
+                f"{_dome_rescaling(positions, diagonal)}, or calibrate in the frame of the scan",
             )
         ]
     spans = [picture_span(camera, surface.vertices) for camera in dome.cameras]
@@ -600,18 +446,14 @@ def _inside(surface: CleanMesh, point: Float64) -> bool:
     return bool(number > MIN_WINDING_NUMBER)
 
 
-def picture_span(
-    camera: CameraRecord, vertices: Float64, *, factor: float = 1.0
-) -> float | None:
+def picture_span(camera: CameraRecord, vertices: Float64) -> float | None:
     """Fraction of the picture's side that the scan spans; None if it is outside the
     picture or behind the camera.
-
-    The camera is taken to be `factor` times as far away.
 
     Distortion is ignored, and the picture is extended by half its size: only scans
     clearly outside count as invisible.
     """
-    local = vertices @ camera.R.T + factor * camera.t
+    local = vertices @ camera.R.T + camera.t
     behind = local[:, 2] <= 0
     if behind.all():
         return None
