@@ -1,6 +1,5 @@
 """Commands that draw, show or export models: render, compare, show, export, view."""
 
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -140,10 +139,7 @@ def compare(
     """Compare the kept photographs with renderings of the model.
 
     The measures are RMSE, PSNR, SSIM and CIEDE2000 for each photograph that ingest kept.
-
-    Likely causes of large residuals are named below the table: a wrong light intensity,
-    a shift, light in shadows, a different gloss, hair. With --json, the figures of each
-    region are printed too.
+    With --json, the figures of each region are printed too.
     """
     comparisons = skindb.workflow.compare_take(
         existing(db), take, generation=generation, **vars(parameters)
@@ -158,8 +154,6 @@ def compare(
             **c.error,
             "filled": c.filled,
             "regions": c.regions,
-            "causes": asdict(c.causes),
-            "likely_causes": c.causes.notable,
         }
         for c in comparisons
     ]
@@ -172,13 +166,8 @@ def compare(
         "ssim",
         "delta_e_median",
     ]
-    lines = aligned([header, *([row[name] for name in header] for row in result)])
-    lines += [
-        f"{c.light} {c.camera}: {'; '.join(c.causes.notable)}"
-        for c in comparisons
-        if c.causes.notable
-    ]
-    emit(result, lines)
+    rows = [[row[name] for name in header] for row in result]
+    emit(result, aligned([header, *rows]))
 
 
 @command

@@ -1,17 +1,16 @@
 """Comparison of kept photographs with the model rendered from the same camera under the
-same light: measures of the error, and its likely causes.
+same light.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
-from scipy import ndimage
 from scipy.ndimage import binary_erosion
 from skimage.metrics import structural_similarity
 
@@ -19,7 +18,13 @@ from skindb.errors import input_error
 from skindb.files import make_private
 from skindb.geometry.rays import RayScene
 from skindb.render.image import auto_exposure, encode_srgb, tone_map, write_png
-from skindb.render.scene import cameras_from_dome, from_model, lights_from_dome
+from skindb.render.scene import (
+    Lights,
+    Surface,
+    cameras_from_dome,
+    from_model,
+    lights_from_dome,
+)
 from skindb.render.shading import (
     View,
     polariser_factor,
@@ -36,23 +41,6 @@ from skindb.types import Array, Bytes, Float32, Float64, Mask, finite_rows, floa
 SSIM_WINDOW = 7
 Float = Float64
 Image = Array
-# of the median of lit pixels; darker pixels of the rendering are in shadow
-LIT_FRACTION = 0.05
-MIN_PIXELS = 50  # of a class, below which its measure is NaN
-SMOOTHING = 1.0  # px, standard deviation of the filter on rendering and residual
-MAX_SHIFT = 2.0  # px, above which the linear estimate is invalid
-# thresholds above which a cause is reported: chosen by judgement. On a virtual face
-# without imperfections only gloss was reported
-NOTABLE_SHIFT = 0.25  # px
-NOTABLE_GAIN = 0.03
-# fraction of the lit skin; ideal virtual captures reach 0.02 where light grazes the
-# face
-NOTABLE_SHADOW = 0.03
-NOTABLE_HIGHLIGHT = 0.1  # fraction of the highlights
-# fraction of the squared residual in surfels that are obstructed or doubtful
-NOTABLE_DOUBTFUL = 0.25
-# part of the rendering that the surface must reflect for a pixel to be in a highlight
-HIGHLIGHT_FRACTION = 0.3
 MIN_REGION_PIXELS = 30  # below which a region is not compared
 # fraction of a pixel's rays that must meet known surface, to exclude silhouettes
 MIN_COVERAGE = 0.999
@@ -160,137 +148,6 @@ def _ssim(rendered: Float, photographed: Float, inside: Mask) -> float:
 
 
 @dataclass(frozen=True)
-class Causes:
-    """Measures of a residual, each with its likely cause; NaN where there are too few pixels.
-
-    Attributes
-    ----------
-    shift
-        (2,) translation of the rendering [px, right and down] that explains most of the
-        residual. Cause: calibration of the camera, or motion.
-    gain
-        Photograph over rendering where skin is lit. Cause: intensity of the light.
-    shadow
-        Mean photograph in shadow over the mean of lit skin. Cause: light from other
-        parts of the face or the room.
-    highlight
-        Photograph over rendering in highlights, after this gain. Cause: gloss, or normals.
-    doubtful
-        Fraction of the squared residual in surfels whose fit is doubtful or obstructed.
-        Cause: hair, eyes.
-    """
-
-    shift: tuple[float, float]
-    gain: float
-    shadow: float
-    highlight: float
-    doubtful: float
-
-    @property
-    def notable(self) -> list[str]:
-        """Descriptions of the causes whose measures exceed their thresholds."""
-        words = []
-        if abs(self.gain - 1) > NOTABLE_GAIN:
-            words.append(f"intensity of the light ({100 * (self.gain - 1):+.0f} %)")
-        if np.hypot(*self.shift) > NOTABLE_SHIFT:
-            words.append(
-                f"calibration of the camera or motion ({np.hypot(*self.shift):.1f} px)"
-            )
-        if self.shadow > NOTABLE_SHADOW:
-            words.append(
-                "light between parts of the face or of the room "
-                f"({100 * self.shadow:.0f} % in shadow)"
-            )
-        if abs(self.highlight - 1) > NOTABLE_HIGHLIGHT:
-            words.append(
-                f"gloss or normals ({100 * (self.highlight - 1):+.0f} % in highlights)"
-            )
-        if self.doubtful > NOTABLE_DOUBTFUL:
-            words.append(
-                f"hair, eyes or doubtful fits ({100 * self.doubtful:.0f} % of the residual)"
-            )
-        return words
-
-
-def find_causes(
-    photographed: Image, rendered: Image, surface: Image, *, mask: Mask, doubtful: Image
-) -> Causes:
-    """Measures of the residual of one photograph.
-
-    Parameters
-    ----------
-    photographed, rendered, surface
-        (h, w, 3) radiance: photograph, rendering, and the part of the rendering that
-        the surface reflects.
-    mask
-        (h, w) pixels that are compared.
-    doubtful
-        (h, w) fraction, from 0 to 1, of the pixel that shows surfels whose fit is
-        doubtful or obstructed.
-    """
-    photo, ours, gloss = (
-        np.where(mask, image.mean(axis=-1), 0.0)
-        for image in (photographed, rendered, surface)
-    )
-    inside = ndimage.binary_erosion(mask, iterations=2)
-    lit = inside & (
-        ours
-        > LIT_FRACTION
-        * (np.median(ours[inside & (ours > 0)]) if (inside & (ours > 0)).any() else 0.0)
-    )
-    lit &= ours > 0
-    if lit.sum() < MIN_PIXELS:
-        return Causes((np.nan, np.nan), np.nan, np.nan, np.nan, np.nan)
-    shiny = gloss > HIGHLIGHT_FRACTION * ours
-    matte = lit & ~shiny
-    matte_or_lit = matte if matte.sum() >= MIN_PIXELS else lit
-    # the median is robust to hair and eyes
-    gain = float(np.median(photo[matte_or_lit] / ours[matte_or_lit]))
-    residual = photo - gain * ours
-    dark = inside & (ours <= LIT_FRACTION * np.median(ours[lit]))
-    shadow = (
-        float(photo[dark].mean() / photo[lit].mean())
-        if dark.sum() >= MIN_PIXELS
-        else np.nan
-    )
-    bright = lit & shiny
-    highlight = (
-        float(photo[bright].sum() / (gain * ours[bright].sum()))
-        if bright.sum() >= MIN_PIXELS
-        else np.nan
-    )
-    square = np.where(inside, residual**2, 0.0)
-    fraction = (
-        float((square * doubtful).sum() / square.sum()) if square.sum() > 0 else 0.0
-    )
-    return Causes(_shift(residual, gain * ours, lit), gain, shadow, highlight, fraction)
-
-
-def _shift(residual: Image, ours: Image, lit: Mask) -> tuple[float, float]:
-    """Translation (right, down) [px] of the rendering that fits the residual best
-    (Lucas and Kanade 1981).
-    """
-    smooth = ndimage.gaussian_filter(ours, SMOOTHING)
-    down, right = np.gradient(smooth)
-    rest = ndimage.gaussian_filter(residual, SMOOTHING)
-    weight = (
-        lit / np.maximum(smooth, 1e-3 * smooth.max()) ** 2
-    )  # relative errors, so that dark and bright skin weigh the same
-    design = np.stack([right[lit], down[lit]], axis=1)
-    normal = (design * weight[lit][:, None]).T @ design
-    if np.linalg.cond(normal) > 1e6:
-        return np.nan, np.nan
-    # a translation by (x, y) changes the picture by minus its gradient times (x, y)
-    x, y = np.linalg.solve(normal, -(design * weight[lit][:, None]).T @ rest[lit])
-    length = float(np.hypot(x, y))
-    return (
-        (float(x), float(y))
-        if length <= MAX_SHIFT
-        else (float(x) * MAX_SHIFT / length, float(y) * MAX_SHIFT / length)
-    )
-
-
-@dataclass(frozen=True)
 class Comparison:
     """One photograph and the model's prediction of it."""
 
@@ -306,7 +163,6 @@ class Comparison:
     error: dict[str, float]  # from `compare_images`
     diffuse: Float32  # (h, w, 3) diffuse part of the rendering
     regions: dict[str, dict[str, float]]  # the same errors for each region, by its name
-    causes: Causes
 
 
 def compare_photographs(
@@ -329,6 +185,21 @@ def compare_photographs(
         Rays per pixel and axis.
     """
     honour_consent(model.attrs, "export")
+    compared = _compared(model, capture, subsurface=subsurface, samples=samples)
+    if not (comparisons := [*compared]):
+        raise input_error(
+            "photographs",
+            "at least one must show the face",
+            "none",
+            "ingest the capture again with more --photographs",
+        )
+    return comparisons
+
+
+def _compared(
+    model: xr.DataTree, capture: xr.DataTree, *, subsurface: bool, samples: int
+) -> Iterator[Comparison]:
+    """Comparisons of the photographs whose cameras see the face."""
     photographs = _kept_photographs(capture)
     dome = capture["dome"].to_dataset()
     surface = from_model(model, fill=True)
@@ -340,42 +211,52 @@ def compare_photographs(
     lights = lights_from_dome(model["dome"].to_dataset())
     unseen_lights, unseen_cameras = (_held_out(model, d) for d in ("light", "camera"))
     regions = _regions(capture)
-    doubtful = 1 - surfel_confidence(model["fitted"].to_dataset()).astype(np.float64)
-    results = []
+    is_filled = surfel_confidence(model["fitted"].to_dataset()) == 0
     for photograph in photographs:
         at_light = int(photograph[variables.PHOTOGRAPH_LIGHT])
         at_camera = int(photograph[variables.PHOTOGRAPH_CAMERA])
         camera = cameras[at_camera]
         view = trace_view(surface, camera, samples=samples, scene=scene)
         lamp = lights.select(at_light)
-        diffuse = shade_view(
-            view, surface, lamp, scene, subsurface=subsurface, terms=("diffuse",)
-        )[0]
-        gloss = shade_view(view, surface, lamp, scene, terms=("surface",))[0]
+        diffuse, gloss = _shaded(view, surface, lamp, scene, subsurface=subsurface)
         if variables.LIGHT_POLARISATION in dome:
-            both = float(
-                dome[variables.LIGHT_POLARISATION][at_light]
-                * dome[variables.CAMERA_POLARISATION][at_camera]
-            )
+            of_light = dome[variables.LIGHT_POLARISATION].values[at_light]
+            both = float(of_light * dome[variables.CAMERA_POLARISATION][at_camera])
             gloss *= polariser_factor(view, lamp.position[0], both, surface.eta)
+        rendered = diffuse + gloss
         radiance = photograph[variables.PHOTOGRAPH_RADIANCE].values
         photo = radiance[: camera.height, : camera.width].astype(np.float32)
         mask = (view.coverage >= MIN_COVERAGE) & finite_rows(photo)
         if not mask.any():
-            continue  # this camera does not see the face
+            continue
         light = str(dome["light"].values[at_light])
         name = str(dome["camera"].values[at_camera])
         is_unseen = light in unseen_lights or name in unseen_cameras
-        taken = _Taken(photo, diffuse, gloss, mask)
-        results.append(taken.compared(light, name, is_unseen, view, regions, doubtful))
-    if not results:
-        raise input_error(
-            "photographs",
-            "at least one must show the face",
-            "none",
-            "ingest the capture again with more --photographs",
+        error = compare_images(rendered, photo, mask=mask)
+        filled = view.image(view.interpolate(is_filled[:, None]))[..., 0]
+        by_region = _by_region(view, regions, rendered, photo, mask, error["exposure"])
+        yield Comparison(
+            light,
+            name,
+            is_unseen,
+            photo,
+            rendered,
+            mask,
+            float(filled[mask].mean()),
+            error,
+            diffuse,
+            by_region,
         )
-    return results
+
+
+def _shaded(
+    view: View, surface: Surface, lamp: Lights, scene: RayScene, *, subsurface: bool
+) -> tuple[Float32, Float32]:
+    """Diffuse and surface part (h, w, 3) of a view under one light."""
+    diffuse = shade_view(
+        view, surface, lamp, scene, subsurface=subsurface, terms=("diffuse",)
+    )
+    return diffuse[0], shade_view(view, surface, lamp, scene, terms=("surface",))[0]
 
 
 def _kept_photographs(capture: xr.DataTree) -> list[xr.Dataset]:
@@ -403,53 +284,6 @@ def _kept_photographs(capture: xr.DataTree) -> list[xr.Dataset]:
     return [
         photographs.isel(photograph=i) for i in range(photographs.sizes["photograph"])
     ]
-
-
-@dataclass(frozen=True)
-class _Taken:
-    """A photograph (h, w, 3), both parts of its rendering, and the pixels compared."""
-
-    photo: Float32
-    diffuse: Float32
-    gloss: Float32
-    mask: Mask
-
-    def compared(
-        self,
-        light: str,
-        camera: str,
-        is_unseen: bool,
-        view: View,
-        regions: dict[str, Float64],
-        doubtful: Float64,
-    ) -> Comparison:
-        """Errors of the rendering, also by region, and their likely causes."""
-        unfitted = view.image(view.interpolate((doubtful == 1.0)[:, None]))[..., 0]
-        rendered = self.diffuse + self.gloss
-        error = compare_images(rendered, self.photo, mask=self.mask)
-        by_region = _by_region(
-            view, regions, rendered, self.photo, self.mask, error["exposure"]
-        )
-        causes = find_causes(
-            np.nan_to_num(self.photo),
-            rendered,
-            self.gloss,
-            mask=self.mask,
-            doubtful=view.image(view.interpolate(doubtful[:, None]))[..., 0],
-        )
-        return Comparison(
-            light,
-            camera,
-            is_unseen,
-            self.photo,
-            rendered,
-            self.mask,
-            float(unfitted[self.mask].mean()),
-            error,
-            self.diffuse,
-            by_region,
-            causes,
-        )
 
 
 def _regions(capture: xr.DataTree) -> dict[str, Float64]:

@@ -7,7 +7,7 @@ import xarray as xr
 from small_face import SIDE, small_face
 
 from skindb.demo.report import Results
-from skindb.render.photographs import Causes, Comparison
+from skindb.render.photographs import Comparison
 from skindb.schema import FitStatus, label
 from skindb.virtual.capture import Recovery
 
@@ -107,10 +107,7 @@ def comparison(light: str, *, held_out: bool, exposure: float = 1.0) -> Comparis
         "delta_e_median": 1.2,
         "exposure": exposure,
     }
-    causes = Causes((0.0, 0.0), 1.0, 1.0, 1.0, 0.0)
-    return Comparison(
-        light, "c0", held_out, image, image, mask, 0.0, error, image, {}, causes
-    )
+    return Comparison(light, "c0", held_out, image, image, mask, 0.0, error, image, {})
 
 
 def _studies(takes: tuple[str, ...]) -> dict[str, xr.DataTree]:
