@@ -56,17 +56,7 @@ def demo(out: Path, parameters: DemoParameters) -> None:
     report.html and viewer.html show them.
     """
     result = skindb.demo.run_demo(out, progress=bar(plain=True), **vars(parameters))
-    stages = [
-        f"{stage:<10} {seconds:7.1f} s" for stage, seconds in result["seconds"].items()
-    ]
-    emit(
-        result,
-        [
-            *(stages if asked("verbose") else []),
-            str(result["report"]),
-            str(result["viewer"]),
-        ],
-    )
+    emit(result, [result["report"], result["viewer"]])
 
 
 @command

@@ -44,7 +44,6 @@ MARGIN = 6  # pixels around a face
 SIZE = (4.4, 3.3)  # inches; text is still readable at 360 px, the width of a phone
 DOTS = 160  # per inch, twice the resolution of a page of 360 px
 INK = "#8a847c"  # of text and lines, readable on light and on dark pages
-MAX_NORMAL_ANGLE = 15  # degrees, end of the axis
 
 
 @dataclass(frozen=True)
@@ -238,19 +237,4 @@ def reflectance_plot(recovered: Mapping[str, Recovery]) -> bytes:
     ax.plot([0, top], [0, top], color=INK, lw=0.7, label="equal")
     ax.set_xlabel("true diffuse reflectance R_d [1]")
     ax.set_ylabel("recovered R_d [1]")
-    return plot_png(ax)
-
-
-def normal_plot(recovered: Mapping[str, Recovery]) -> bytes:
-    """Plot of the cumulative distribution of the error of normals, one line for each take."""
-    ax = axes()
-    ax.set_prop_cycle(color=plots.CYCLE)
-    for i, (take, recovery) in enumerate(recovered.items()):
-        angle = recovery.normal_angle[recovery.fitted]
-        angle = np.sort(angle[np.isfinite(angle)])
-        dashes = "-" if i < len(plots.CYCLE) else "--"
-        ax.plot(angle, np.linspace(0, 100, len(angle)), dashes, label=take)
-    ax.set_xlim(0, MAX_NORMAL_ANGLE)
-    ax.set_xlabel("angle between recovered and true normal [deg]")
-    ax.set_ylabel("fitted surfels below [%]")
     return plot_png(ax)

@@ -6,8 +6,7 @@ from __future__ import annotations
 
 import base64
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,6 @@ from skindb.demo.page import (
     axes,
     draw_portraits,
     map_pictures,
-    normal_plot,
     plot_png,
     portrait,
     predictions,
@@ -50,7 +48,7 @@ LEAST_PERCENT = 0.1  # smallest percentage that is written as a number
 
 @dataclass
 class Results:
-    """Models, errors, studies, edits and run times of a demo."""
+    """Models, errors, studies and edits of a demo."""
 
     models: dict[str, xr.DataTree] = field(default_factory=dict)
     fits: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -60,15 +58,7 @@ class Results:
     edits: dict[float, xr.DataTree] = field(default_factory=dict)
     edited_take: str = ""
     target_take: str = ""  # the measured take that the edit at amount 1 should match
-    seconds: dict[str, float] = field(default_factory=dict)
     began: float = field(default_factory=time.monotonic)
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Measure the time of a stage and add it to `seconds`."""
-        start = time.monotonic()
-        yield
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - start
 
     def sort_takes(self, takes: Sequence[str]) -> None:
         """Sort the takes, which processes may have finished in any order, into the given order."""
@@ -82,8 +72,6 @@ class Results:
         """Add the results of another process."""
         for name in PER_TAKE:
             getattr(self, name).update(getattr(results, name))
-        for name, seconds in results.seconds.items():
-            self.seconds[name] = self.seconds.get(name, 0.0) + seconds
 
 
 def status_counts(model: xr.DataTree) -> dict[FitStatus, int]:
@@ -229,7 +217,7 @@ def write_report(path: Path, results: Results, *, progress: Progress) -> Path:
         "viewer": VIEWER,
         "minutes": (time.monotonic() - results.began) / 60,
     }
-    sections = (_subjects, _photographs, _recovered, _population, _edit, _times)
+    sections = (_subjects, _photographs, _recovered, _population, _edit)
     for i, section in enumerate(sections):
         progress("report", i, len(sections))
         content |= section(results, portraits)
@@ -311,7 +299,6 @@ def _recovered(results: Results, _: Portraits) -> dict[str, Any]:
     curve = study["brdf"]["basis_size"].to_dataset().load()
     plots = {
         "reflectance": reflectance_plot(recovered),
-        "normal": normal_plot(recovered),
         "translucency": plot_png(plot_translucency(table, ax=axes())),
         "albedo": plot_png(plot_albedo(histograms, ax=axes())),
         "basis_size": plot_png(plot_basis_size(curve, ax=axes())),
@@ -385,13 +372,3 @@ def _edit(results: Results, portraits: Portraits) -> dict[str, Any]:
 def _breakable(name: str) -> str:
     """A name with spaces, so that it can be broken on a narrow page."""
     return name.replace(":", ": ").replace("_", " ")
-
-
-def _times(results: Results, _: Portraits) -> dict[str, Any]:
-    """Wall time [s] of the stages of the demo, and of the stages of a fit as mean over takes."""
-    stages = {name: x for name, x in results.seconds.items() if name != "report"}
-    inside = DataFrame([fit["seconds"] for fit in results.fits.values()]).mean()
-    header = ["stage", "seconds"]
-    demo = DataFrame([*stages.items()], columns=header)
-    fits = DataFrame([*inside.items()], columns=header)
-    return {"times": {"demo": demo, "fit": fits}}

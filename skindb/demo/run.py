@@ -49,8 +49,8 @@ def run_demo(
     Returns
     -------
     dict
-        Paths of report, viewer and db, seconds per stage, and the errors of the
-        recovered values of each take.
+        Paths of report, viewer and db, and the errors of the recovered values of each
+        take.
 
     Raises
     ------
@@ -64,30 +64,25 @@ def run_demo(
     db = Database(out / "db")
     workers = parameters.workers or min(thread_count(), MAX_WORKERS)
     results = _make_takes(out, parameters, workers, report_progress)
-    with results.stage("analyze"):
-        # once, for every study
-        workflow.register_takes(db, workers=workers, progress=report_progress)
-        for name, study_options in _studies(parameters).items():
-            results.studies[name] = workflow.study(db, name, **study_options)
-    with results.stage("edit"):
-        _edit(results, db)
+    # once, for every study
+    workflow.register_takes(db, workers=workers, progress=report_progress)
+    for name, study_options in _studies(parameters).items():
+        results.studies[name] = workflow.study(db, name, **study_options)
+    _edit(results, db)
     exported = next(iter(results.models))
     model = results.models[exported]
-    with results.stage("export"):
-        export_bundle(
-            model,
-            out / "export" / exported,
-            size=MAP_TEXELS,
-            merl=False,
-            progress=report_progress,
-        )
-    with results.stage("view"):
-        traits = {EDIT_CONDITION: 1.0} if results.edited_take == exported else {}
-        workflow.view_takes(
-            db, [exported], out / VIEWER, traits=traits, progress=report_progress
-        )
-    with results.stage("report"):
-        report = write_report(out / "report.html", results, progress=report_progress)
+    export_bundle(
+        model,
+        out / "export" / exported,
+        size=MAP_TEXELS,
+        merl=False,
+        progress=report_progress,
+    )
+    traits = {EDIT_CONDITION: 1.0} if results.edited_take == exported else {}
+    workflow.view_takes(
+        db, [exported], out / VIEWER, traits=traits, progress=report_progress
+    )
+    report = write_report(out / "report.html", results, progress=report_progress)
     recovered = {
         take: recovery.summary() for take, recovery in results.recovered.items()
     }
@@ -95,7 +90,6 @@ def run_demo(
         "report": str(report),
         "viewer": str(out / VIEWER),
         "db": db.url,
-        "seconds": results.seconds,
         "recovered": recovered,
     }
 
@@ -176,29 +170,21 @@ def _make_take(
     db = Database(out / "db")
     seed = parameters.seed
     virtual = SimulationParameters(parameters.cameras, parameters.lights, seed=seed)
-    with results.stage("simulate"):
-        (folder,) = simulate_takes(
-            out / "captures", virtual, takes=[i], progress=progress
+    (folder,) = simulate_takes(out / "captures", virtual, takes=[i], progress=progress)
+    take = workflow.ingest_take(db, folder, spacing_mm=SPACING, progress=progress).take
+    fitted = FitParameters(hold_out_lights=HELD_OUT, seed=seed)
+    record = workflow.fit_take(db, take, fitted, progress=progress)
+    results.fits[take] = record.provenance
+    model = db.read("model", take)
+    results.models[take] = model.map_over_datasets(lambda ds: ds.load())
+    results.models[take].attrs = model.attrs
+    results.compared[take] = compare_photographs(
+        results.models[take], db.read("capture", take)
+    )
+    with np.load(folder.with_name(folder.name + ".truth.npz")) as truth:
+        results.recovered[take] = recovered_against_true(
+            results.models[take], dict(truth)
         )
-    with results.stage("ingest"):
-        take = workflow.ingest_take(
-            db, folder, spacing_mm=SPACING, progress=progress
-        ).take
-    with results.stage("fit"):
-        fitted = FitParameters(hold_out_lights=HELD_OUT, seed=seed)
-        record = workflow.fit_take(db, take, fitted, progress=progress)
-        results.fits[take] = record.provenance
-    with results.stage("compare"):
-        model = db.read("model", take)
-        results.models[take] = model.map_over_datasets(lambda ds: ds.load())
-        results.models[take].attrs = model.attrs
-        results.compared[take] = compare_photographs(
-            results.models[take], db.read("capture", take)
-        )
-        with np.load(folder.with_name(folder.name + ".truth.npz")) as truth:
-            results.recovered[take] = recovered_against_true(
-                results.models[take], dict(truth)
-            )
     return results
 
 

@@ -1,4 +1,4 @@
-"""Planted results of a demo: small models, errors, tables and run times."""
+"""Planted results of a demo: small models, errors and tables."""
 
 from __future__ import annotations
 
@@ -30,17 +30,13 @@ def planted_results(takes: tuple[str, ...] = TAKES) -> Results:
     results = Results()
     for take in takes:
         results.models[take] = _model(take)
-        results.fits[take] = {
-            "seconds": {"first pass": 2.0},
-            "held_out_error": {"median": HELD_OUT_ERROR},
-        }
+        results.fits[take] = {"held_out_error": {"median": HELD_OUT_ERROR}}
         results.recovered[take] = _recovery(results.models[take])
         results.compared[take] = [
             comparison("l0", held_out=False),
             comparison("l1", held_out=True),
         ]
     results.studies = _studies(takes)
-    results.seconds = {"simulate": 60.0, "fit": 100.0, "report": 1.0}
     results.edited_take = takes[0]
     results.target_take = takes[1]
     for amount, distance in ((0.0, 0.0), (1.0, 0.4)):
