@@ -50,9 +50,10 @@ def tidy(cohort: Dataset) -> pd.DataFrame:
         Columns take, subject, condition, visit and repeat; quantity; region, also for
         sites of the probe; channel (R, G, B, or missing); value, NaN where there is
         none to be trusted, in `unit`; `error`, its standard error without
-        `common_error`, which all takes have in common; status; label (the class of an
-        individual typology angle); and each attribute of the captures, as
-        ``attribute_<name>`` if it has the name of another column.
+        `common_error`, the errors of level and model, which are taken to be the same
+        for all takes; status; label (the class of an individual typology angle); and
+        each attribute of the captures, as ``attribute_<name>`` if it has the name of
+        another column.
 
         Quantities: R_d, surface reflectance and sigma_tr; CIELAB L*, a*, b*, individual
         typology angle (ITA), melanin index and erythema index of R_d, see
@@ -145,6 +146,7 @@ def _differences(
         reflectance.labels[:1],
         values,
         errors,
+        nothing,
         nothing,
         words,
     )

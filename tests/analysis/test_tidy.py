@@ -14,7 +14,12 @@ from planted_tables import planted_tables
 
 from skindb.analysis import group_effects, tidy
 from skindb.analysis.colour import typology_angle, typology_class
-from skindb.analysis.quantities import QUANTITIES, measurements
+from skindb.analysis.quantities import (
+    QUANTITIES,
+    SURFACE_NOISE,
+    SURFACE_NOISE_HIDDEN,
+    measurements,
+)
 from skindb.cli import cli
 from skindb.errors import InputError
 from skindb.store import Database
@@ -119,6 +124,16 @@ def test_tidy__columns(cohort):
     assert row.attribute_unit == "a"
     assert row.value == SKIN[1, 1]
     assert (row.error, row.common_error) == pytest.approx((ERROR, LEVEL))
+    surface = frame[frame.quantity == "surface reflectance"]
+    assert surface.error.isna().all()  # none is stated
+    named = cohort.assign_coords(region=["face", "nose"])
+    stated = named.assign(
+        region_surface_reflectance_error=named["region_surface_reflectance"] * 0
+    )
+    assert [*tidy(stated).query("quantity == 'surface reflectance'").error[:2]] == [
+        SURFACE_NOISE,
+        SURFACE_NOISE_HIDDEN,
+    ]
     units = {name: set(part.unit) for name, part in frame.groupby("quantity")}
     assert units["ITA"] == {"degree"}
     assert units["sigma_tr"] == {"mm-1"}
