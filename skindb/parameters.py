@@ -392,7 +392,8 @@ class PictureParameters(Limited):
     )
     width_mm: float | None = option(
         None,
-        "Width of a picture on the subject in mm.  [default: 250 on the longer side]",
+        "Width of a picture on the subject in mm.  [default: 250 on the longer side, or "
+        "6 a pixel if that is less]",
         name="width",
         minimum=0,
         maximum=MAX_WIDTH_MM,

@@ -42,6 +42,10 @@ from skindb.types import Mask, Progress, silent
 CAMERA = "c00"
 # mm; distance of a camera whose lens is not known: perspective is below a hundredth
 CAMERA_DISTANCE_MM = 10_000.0
+# mm; of the longer side, and of a pixel at most: wider ones get no samples where the surface
+# is oblique, see MAX_SMEAR_MM of skindb/ingest/lumitexels.py
+WIDTH_MM = 250.0
+MAX_PIXEL_MM = 6.0
 # R_d of a facing surface that is as bright as the white level
 WHITE_REFLECTANCE = 0.5
 # of the radiances of linear files, which takes the place of the white level
@@ -89,7 +93,7 @@ def import_images(
         Of `skindb.parameters.PictureParameters`: lights, by default lights.csv or the
         only .lp file in the folder; mirror_ball; mask, by default the picture `*mask*`
         in the folder, if there is one; response; width_mm, by default 250 for the
-        longer side.
+        longer side, or less for pixels of at most 6 mm.
 
     Returns
     -------
@@ -130,7 +134,7 @@ def import_images(
     inside = _mask(chosen.mask or _only(masks), frames.size)
     width_mm = chosen.width_mm
     if width_mm is None:
-        width_mm = 250.0 * width / max(width, height)
+        width_mm = width * min(WIDTH_MM / max(width, height), MAX_PIXEL_MM)
         notes.append(
             f"the picture is taken as {width_mm:.0f} mm wide on the subject; --width states it"
         )

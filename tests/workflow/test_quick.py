@@ -87,6 +87,19 @@ def test_three_lights_are_enough(tmp_path: Path) -> None:
     assert "lambert 100.0%" in result.stdout
 
 
+def test_quick_measures_crops_of_a_few_pixels(pictures: Path, tmp_path: Path) -> None:
+    crop = np.s_[14:18, 30:34]
+    for file in pictures.glob("*.png"):
+        write_frame(file, read_frame(file)[crop])
+    result = run("quick", pictures, tmp_path / "out", "--eta", 1, "--no-progress")
+    assert result.returncode == 0, result.stderr
+    assert "24 mm wide" in result.stderr
+    normal = read_exr(tmp_path / "out/normals.exr")[0]
+    cosine = (normal * sphere_normals()[crop]).sum(axis=-1)
+    # the limit of the whole sphere
+    assert np.degrees(np.arccos(cosine.min().clip(-1, 1))) < 0.5
+
+
 def test_quick_says_how_coarse_its_maps_are(pictures: Path, tmp_path: Path) -> None:
     result = run("quick", pictures, tmp_path / "out", "--no-progress", "--points", 1000)
     assert "maps have a pixel for 2 x 2 of the pictures" in result.stderr
