@@ -30,7 +30,8 @@ MIN_SUBJECTS = 3  # for a variance between or within subjects
 SURFACE = "surface reflectance"
 # noise of the mean surface reflectance of a region between takes, which the stated errors
 # of surfels omit: standard deviation about the regression on the truth, in 11 virtual
-# subjects of 4 cameras and 24 lights (0.0004 to 0.0006; 0.0019 to 0.0020 in HIDDEN)
+# subjects of 4 cameras and 24 lights (0.0004 to 0.0006; 0.0019 to 0.0020 in HIDDEN);
+# docs/howto/population.md has the validation on another dome
 SURFACE_NOISE = 0.0006
 SURFACE_NOISE_HIDDEN = 0.002
 HIDDEN = ("nose", "lips", "neck")  # regions of which few lights show the highlight
