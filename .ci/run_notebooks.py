@@ -1,4 +1,5 @@
-"""Run every notebook with a copy of the database that `make demo` wrote.
+"""Run every notebook with a copy of its own of the database that `make demo` wrote, two at
+a time.
 
 The executed copies are written to `docs/_build/notebooks` and used by `make docs`, so
 that notebooks run only once.
@@ -8,6 +9,7 @@ from __future__ import annotations
 
 import sys
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from shutil import copytree
 
@@ -18,23 +20,26 @@ ROOT = Path(__file__).resolve().parents[1]
 EXECUTED = ROOT / "docs" / "_build" / "notebooks"
 
 
-def main() -> int:
-    """Run the notebooks and store their outputs; stops with the traceback of an
-    exception in a cell.
-    """
-    EXECUTED.mkdir(parents=True, exist_ok=True)
-    paths = sorted((ROOT / "notebooks").glob("*.ipynb"))
+def run(path: Path) -> None:
+    """Run a notebook and store its outputs; raises the exception of a cell."""
+    notebook = nbformat.read(path, as_version=4)
     with tempfile.TemporaryDirectory() as folder:
         copytree(ROOT / "demo/db", Path(folder) / "demo/db")
         work = Path(folder) / "notebooks"
         work.mkdir()
-        for path in paths:
-            notebook = nbformat.read(path, as_version=4)
-            place = {"metadata": {"path": str(work)}}
-            NotebookClient(notebook, timeout=None, resources=place).execute()
-            nbformat.write(notebook, EXECUTED / path.name)
-            cells = sum(cell.cell_type == "code" for cell in notebook.cells)
-            sys.stdout.write(f"{path.name}: {cells} cells run\n")
+        place = {"metadata": {"path": str(work)}}
+        NotebookClient(notebook, timeout=None, resources=place).execute()
+    nbformat.write(notebook, EXECUTED / path.name)
+    cells = sum(cell.cell_type == "code" for cell in notebook.cells)
+    sys.stdout.write(f"{path.name}: {cells} cells run\n")
+
+
+def main() -> int:
+    """Run the notebooks; stops with the traceback of an exception in a cell."""
+    EXECUTED.mkdir(parents=True, exist_ok=True)
+    paths = sorted((ROOT / "notebooks").glob("*.ipynb"))
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(run, paths))
     return 0 if paths else 1
 
 
