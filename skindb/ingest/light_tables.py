@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -30,14 +30,16 @@ class Light:
     vector: Float64  # (3,) direction, or position in mm
     distant: bool
     gain: float = 1.0  # relative intensity
+    by_order: bool = False  # whether its line does not name the picture
 
 
-def read_lights(path: Path) -> list[Light]:
+def read_lights(path: Path, pictures: Sequence[str] = ()) -> list[Light]:
     """Lights of a CSV or RTI .lp file, in its order.
 
     Values are separated by commas, semicolons, tabs or spaces. Without a header, a line is a
-    name and a direction; a header names columns: the first one is the picture, `x, y, z`
-    a direction or `x_mm, y_mm, z_mm` a position, `intensity` a relative intensity.
+    name and a direction, or a direction alone if every line is one of `pictures` in their
+    order; a header names columns: the first one is the picture, `x, y, z` a direction or
+    `x_mm, y_mm, z_mm` a position, `intensity` a relative intensity.
 
     Raises
     ------
@@ -51,8 +53,11 @@ def read_lights(path: Path) -> list[Light]:
     faults = list[Fault]()
     found = list[Light]()
     header = list[str]()
-    for number, line in enumerate(text.splitlines(), 1):
-        words = _words(line)
+    lines = [_words(line) for line in text.splitlines()]
+    by_order = _is_unnamed(lines)
+    if by_order:
+        lines = _named(lines, pictures, path)
+    for number, words in enumerate(lines, 1):
         if not words or (not found and len(words) == 1 and words[0].isdigit()):
             continue  # .lp files begin with the number of pictures
         values = numbers(words[1:])
@@ -62,7 +67,7 @@ def read_lights(path: Path) -> list[Light]:
         place = f"{path}, line {number}"
         light = attempt(faults, partial(_table_light, words, header, place))
         if light is not None:
-            found.append(light)
+            found.append(replace(light, by_order=by_order))
     names = [light.name for light in found]
     for name in sorted({name for name in names if names.count(name) > 1}):
         faults.append(
@@ -80,6 +85,30 @@ def read_lights(path: Path) -> list[Light]:
             path, f"must have 1 to {MAX_LIGHTS:,} lights", f"{len(found)} lights"
         )
     return found
+
+
+def _is_unnamed(lines: Sequence[Sequence[str]]) -> bool:
+    """Whether every line of a table is a direction without the name of a picture."""
+    used = [words for words in lines if words]
+    return bool(used) and all(
+        len(words) == len(COLUMNS) and None not in numbers(words) for words in used
+    )
+
+
+def _named(
+    lines: Sequence[list[str]], pictures: Sequence[str], path: Path
+) -> list[list[str]]:
+    """Directions with the names of the pictures in front."""
+    count = sum(map(bool, lines))
+    require(
+        count == len(pictures),
+        str(path),
+        "directions without names must be those of all pictures, in their order",
+        f"{count} lines for {len(pictures)} pictures",
+        "write the name of its picture in front of each direction",
+    )
+    names = iter(pictures)
+    return [[next(names), *words] if words else words for words in lines]
 
 
 def _words(line: str) -> list[str]:

@@ -126,7 +126,11 @@ def import_images(
         notes.append(f"{len(table)} directions of lights from the mirror ball")
     else:
         place = _table_file(source, chosen.lights)
-        table = read_lights(place)
+        table = read_lights(place, [file.name for file in files])
+        if table[0].by_order:
+            notes.append(
+                f"the directions are those of the pictures in their order, {files[0].name} first"
+            )
     matched = _matched(source, files, table)
     notes += _require_directions(place, table)
     frames = _Frames(out, _typical(matched), chosen.response)
@@ -265,9 +269,13 @@ class _Frames:
         self.exposures = dict[float, str]()  # by EXIF -> a file
         self.automatic_white = False
         self.newest = 0.0  # time of the newest picture
-        self.notes = [
-            "pictures of 8 bits are taken as sRGB; --response linear if they are not"
-        ] * automatic
+        self.notes = list[str]()
+        if response == "auto" and not self.linear:
+            states = ("sRGB", "linear") if automatic else ("linear", "srgb")
+            self.notes.append(
+                f"pictures of {8 * self.dtype.itemsize} bits are taken as {states[0]}; "
+                f"--response {states[1]} if they are not"
+            )
 
     def _table(self, response: str, automatic: bool) -> str:
         """Table of a response that is a word or a file; empty for linear values."""

@@ -312,6 +312,34 @@ def test_tables_of_lights(tmp_path: Path, text: str, lights: int) -> None:
     assert table[1].name == "b.png"
 
 
+def test_directions_without_names_are_those_of_the_pictures_in_their_order(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "light_directions.txt"
+    path.write_text("1 0 1\n\n0.5 -0.5 1\n")
+    table = read_lights(path, ["p2.png", "p10.png"])
+    assert [light.name for light in table] == ["p2.png", "p10.png"]
+    assert np.array_equal(table[1].vector, [0.5, -0.5, 1])
+    with pytest.raises(InputError, match="2 lines for 3 pictures"):
+        read_lights(path, ["p2.png", "p10.png", "q.png"])
+    # a name is missing in one line only
+    path.write_text("a.png 1 0 1\n0.5 -0.5 1\n")
+    with pytest.raises(InputError, match="line 2"):
+        read_lights(path, ["a.png", "b.png"])
+
+
+def test_what_is_assumed_of_pictures_is_noted(tmp_path: Path) -> None:
+    lights = directions(4)
+    write_pictures(tmp_path / "pictures", lights, suffix=".tif")
+    table = tmp_path / "directions.txt"
+    np.savetxt(table, lights)
+    notes = import_images(
+        tmp_path / "pictures", tmp_path / "capture", PERSON, lights=table
+    ).notes
+    assert any("16 bits are taken as linear; --response srgb" in note for note in notes)
+    assert any("in their order" in note for note in notes)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
