@@ -13,6 +13,7 @@ import skindb
 from skindb.cli.options import PATH, command, options_of
 from skindb.cli.shared import emit
 from skindb.cli.terminal import bar, echo
+from skindb.limits import MAX_VISIT
 from skindb.parameters import ImportParameters, QuickParameters
 
 SOURCE = click.argument("source", type=PATH)
@@ -42,6 +43,11 @@ OUT = click.argument("out", type=PATH)
     "--reference", required=True, help="Reference to the signed consent form."
 )
 @click.option("--condition", default="normal", help="Condition of the skin.")
+@click.option(
+    "--visit",
+    type=click.IntRange(1, MAX_VISIT),
+    help="Visit of the subject.  [default: ingest numbers sessions by their times]",
+)
 @options_of(ImportParameters)
 def import_command(
     source: Path,
@@ -51,6 +57,7 @@ def import_command(
     consent: str,
     reference: str,
     condition: str,
+    visit: int | None,
     parameters: ImportParameters,
 ) -> None:
     """Write the capture folder OUT from the pictures in the folder SOURCE.
@@ -65,7 +72,7 @@ def import_command(
             "scope": [word.strip() for word in consent.split(",")],
             "reference": reference,
         },
-    }
+    } | ({} if visit is None else {"visit": visit})
     call = getattr(skindb.ingest, f"import_{layout}")
     result = call(source, out, person, progress=bar(), **asdict(parameters))
     for note in result.notes:

@@ -125,6 +125,7 @@ def test_quick_reports_notes_of_the_ingest(pictures: Path, tmp_path: Path) -> No
 def test_import_then_ingest_and_fit(pictures: Path, tmp_path: Path) -> None:
     capture = tmp_path / "capture"
     person = ["--subject", "3", "--consent", "fit", "--reference", "form 1"]
+    person += ["--visit", "2"]
     result = run("import", pictures, capture, "--as", "images", *person)
     assert result.returncode == 0, result.stderr
     assert "250 mm wide" in result.stderr
@@ -135,7 +136,7 @@ def test_import_then_ingest_and_fit(pictures: Path, tmp_path: Path) -> None:
         result = run(*words, "--no-progress")
         assert result.returncode == 0, result.stderr
     result = run("info", tmp_path / "db")
-    assert "3" in result.stdout
+    assert "3.normal.2" in result.stdout
 
 
 def test_a_capture_that_is_unchanged_is_not_stored_again(
