@@ -5,30 +5,31 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from skindb.schema import GROUPS, Explained, FitStatus, ProbeStatus
+from skindb.schema import GROUPS, Explained, FitStatus, ProbeStatus, Variable
 
 PAGE = Path(__file__).with_name("variables.md")
 HEAD = """# Variables
 
 This page is generated from `skindb/schema` by `make docs`. It lists every stored
-variable with dims, dtype and units.
+variable with its dtype, its dims in round brackets and its units in square ones;
+variables without units are dimensionless. Published sources follow the meaning.
 """
 
 
+def _row(v: Variable) -> str:
+    dims = f"({', '.join(v.dims)})" if v.dims else ""
+    units = "" if v.units == "1" else f" [{v.units}]"
+    source = "" if v.source == "skindb" else f" ({v.source})"
+    return f"| `{v.name}` | {v.dtype}{dims}{units} | {v.doc}{source} |"
+
+
 def _group(name: str) -> str:
-    rows = [
-        (
-            f"| `{v.name}` | {' '.join(v.dims)} | {v.dtype} | {v.units} | {v.doc} | "
-            f"{v.source} |"
-        ).replace("||", "|")
-        for v in GROUPS[name]
-    ]
     return "\n".join(
         [
             f"\n## {name}\n",
-            "| variable | dims | dtype | units | meaning | source |",
-            "|---|---|---|---|---|---|",
-            *rows,
+            "| variable | type | meaning |",
+            "|---|---|---|",
+            *map(_row, GROUPS[name]),
         ]
     )
 
