@@ -53,7 +53,8 @@ def tidy(cohort: Dataset) -> pd.DataFrame:
         `common_error`, the errors of level and model, which are taken to be the same
         for all takes; status; label (the class of an individual typology angle); and
         each attribute of the captures, as ``attribute_<name>`` if it has the name of
-        another column.
+        another column. Takes without a white target have R_d with the status
+        "relative" and no colours.
 
         Quantities: R_d, surface reflectance and sigma_tr; CIELAB L*, a*, b*, individual
         typology angle (ITA), melanin index and erythema index of R_d, see
@@ -120,6 +121,7 @@ def _differences(
     first = dict(zip(normal["subject"][::-1], normal.index[::-1], strict=True))
     baseline = np.array([first.get(subject, -1) for subject in takes["subject"]])
     is_compared = (baseline >= 0) & (baseline != takes.index)
+    is_compared &= (reflectance.status != "relative").all(axis=(1, 2))
     before = reflectance.values[baseline]
 
     def change(now: Array) -> Array:

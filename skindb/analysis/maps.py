@@ -18,6 +18,7 @@ from skindb.analysis.quantities import (
     Quantities,
     Quantity,
     chosen_quantities,
+    is_relative,
 )
 from skindb.analysis.study import (
     Population,
@@ -29,7 +30,7 @@ from skindb.analysis.study import (
     table_of,
 )
 from skindb.analysis.subjects import notes_on_attributes, subjects_of
-from skindb.errors import Fault, InputError, input_error
+from skindb.errors import Fault, InputError, input_error, require
 from skindb.parameters import ContrastParameters, permutations_option
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
@@ -203,6 +204,13 @@ def _require_divisor(size: int, texels: int) -> None:
 
 def _texel_quantities(takes: Dataset, *, quantity: Quantity, size: int) -> Quantities:
     """Values of a quantity at every texel (and channel) of every take, as quantities."""
+    require(
+        quantity.derive is None or not is_relative(takes).any(),
+        f"quantity {quantity.name}",
+        "needs absolute reflectance",
+        f"{is_relative(takes).sum()} takes without a white target",
+        "name other takes with --take, or compare R_d",
+    )
     names = [quantity.mapped, variables.TEXEL_COVERAGE]
     values = np.stack(each_take(_block_means, takes, names, quantity, size))
     return Quantities(values, tuple(map(str, takes["subject"].values)))

@@ -26,6 +26,7 @@ from skindb.schema.label import CHANNELS
 from skindb.types import AnyArray, Array, Index, Mask, float64
 
 NORMAL_95 = 1.96
+RELATIVE = "fit_relative_reflectance"  # coordinate, 1 without a white target
 MIN_SUBJECTS = 3  # for a variance between or within subjects
 SURFACE = "surface reflectance"
 # noise of the mean surface reflectance of a region between takes, which the stated errors
@@ -238,7 +239,8 @@ def measurements(
 
     Errors of derived quantities are propagated to first order from those of R_d, which
     are independent between channels, and from the error of its level, which they share.
-    Those of surface reflectance are at least the noise between virtual subjects.
+    Those of surface reflectance are at least the noise between virtual subjects. Takes
+    without a white target have no colours, and R_d has the status "relative".
 
     Parameters
     ----------
@@ -253,10 +255,24 @@ def measurements(
     if LEVEL in cohort.coords:
         level = np.nan_to_num(cohort[LEVEL].values.astype(float))
     quantities = chosen_quantities(names)
-    return [_measured(tables, q, level) for q in quantities if q.tabulated in tables]
+    relative = is_relative(cohort)
+    return [
+        _measured(tables, quantity, level, relative)
+        for quantity in quantities
+        if quantity.tabulated in tables
+    ]
 
 
-def _measured(tables: Dataset, quantity: Quantity, level: Array) -> Measurement:
+def is_relative(cohort: Dataset) -> Mask:
+    """Whether each take (take,) has no white target, so that R_d has an unknown scale."""
+    if RELATIVE not in cohort.coords:
+        return np.zeros(cohort.sizes["take"], bool)
+    return np.array([value == 1 for value in cohort[RELATIVE].values.tolist()], bool)
+
+
+def _measured(
+    tables: Dataset, quantity: Quantity, level: Array, relative: Mask
+) -> Measurement:
     """A quantity of the takes whose levels have the errors `level` (take,)."""
     is_site = "site" in quantity.dims
     dims = ["take", *quantity.dims]
@@ -283,13 +299,16 @@ def _measured(tables: Dataset, quantity: Quantity, level: Array) -> Measurement:
         ]
         error = np.maximum(error, noise)
     if quantity.derive is not None:
-        reflectance = values
+        reflectance = values.copy()
+        reflectance[relative] = np.nan
         values = quantity.derive(reflectance)
         propagate = partial(propagated, quantity.derive, reflectance)
         error, of_level = propagate(error, of_level[..., 0])
         model, _ = propagate(model, np.zeros_like(values))
     common = np.hypot(of_level, model)
-    status = np.where(np.isfinite(values), "fitted", "missing")
+    status = np.where(np.isfinite(values), "fitted", "missing").astype(object)
+    if quantity.tabulated == REFLECTANCE.tabulated:
+        status[relative] = "relative"
     if is_site:
         words = {int(one): one.name.lower() for one in ProbeStatus}
         codes = tables[variables.SITE_STATUS].transpose(*dims).values

@@ -322,12 +322,12 @@ def tidy(db: str, takes: tuple[str, ...], release: str | None, out: Path) -> Non
     table, skipped = skindb.workflow.tidy_table(
         existing(db), takes=takes, release=release
     )
-    file = private_file(out)
     if out.suffix == ".csv":
-        file.write_text(csv_text([*table], table.values.tolist()), encoding="utf-8")
+        text = csv_text([*table], table.values.tolist())
+        private_file(out).write_text(text, encoding="utf-8")
     else:
         try:
-            table.to_parquet(file)
+            table.to_parquet(private_file(out))
         except ImportError:
             raise input_error(
                 str(out), "needs pyarrow", "none", "pip install pyarrow, or write .csv"

@@ -38,9 +38,11 @@ COMPARED = (
 )
 EVEN = ("even_reflection", "even_reflection_error")
 # attributes of models that cohorts name beside the parameters of the fit
-OF_MODEL = ("dictionary", "dictionary_digest", *EVEN)
+OF_MODEL = ("dictionary", "dictionary_digest", "relative_reflectance", *EVEN)
 # coordinate -> parameter of the fit, or attribute of the model
-FIT_COORDS = {f"fit_{name}": name for name in (*COMPARED, *EVEN)}
+FIT_COORDS = {
+    f"fit_{name}": name for name in (*COMPARED, "relative_reflectance", *EVEN)
+}
 # columns of the catalogue and coordinates of cohorts that are no attributes
 COLUMN = re.compile(
     r"take|subject|condition|visit|repeat|session|consent|outdated|(fit|status|attribute)_.*|(.*_)?(generation|created)",

@@ -15,6 +15,7 @@ from planted_tables import planted_tables
 from skindb.analysis import group_effects, tidy
 from skindb.analysis.colour import typology_angle, typology_class
 from skindb.analysis.quantities import (
+    DERIVED,
     QUANTITIES,
     SURFACE_NOISE,
     SURFACE_NOISE_HIDDEN,
@@ -106,6 +107,21 @@ def test_tidy__errors_are_those_of_a_simulation(cohort):
     ]
     drawn = colour.delta_E(*lab, method="CIE 2000").std(axis=0)
     np.testing.assert_allclose(face(frame, "delta E").error.iloc[1:3], drawn, rtol=0.06)
+
+
+def test_tidy__reflectance_of_unknown_scale_has_no_colour(cohort):
+    relative = ("take", np.array([None, True, None, None], object))
+    frame = tidy(cohort.assign_coords(fit_relative_reflectance=relative))
+    whole = tidy(cohort)
+    own = frame["take"] == "S1.normal.2"
+    reflectance = frame.quantity == "R_d"
+    assert (frame.status[own & reflectance] == "relative").all()
+    same = ~own | frame.quantity.isin(["R_d", "surface reflectance", "sigma_tr"])
+    pd.testing.assert_series_equal(frame.value[same], whole.value[same])
+    colours = frame[~same]
+    assert set(colours.quantity) == {*DERIVED, "delta E"}
+    assert colours.value.isna().all()
+    assert (colours.label == "").all()
 
 
 def test_tidy__columns(cohort):
