@@ -121,7 +121,8 @@ def _differences(
     first = dict(zip(normal["subject"][::-1], normal.index[::-1], strict=True))
     baseline = np.array([first.get(subject, -1) for subject in takes["subject"]])
     is_compared = (baseline >= 0) & (baseline != takes.index)
-    is_compared &= (reflectance.status != "relative").all(axis=(1, 2))
+    is_absolute = (reflectance.status != "relative").all(axis=(1, 2))
+    is_compared &= is_absolute & is_absolute[baseline]
     before = reflectance.values[baseline]
 
     def change(now: Array) -> Array:

@@ -124,6 +124,14 @@ def test_tidy__reflectance_of_unknown_scale_has_no_colour(cohort):
     assert (colours.label == "").all()
 
 
+def test_tidy__a_baseline_of_unknown_scale_has_no_difference(cohort):
+    relative = ("take", np.array([True, None, None, None], object))
+    frame = tidy(cohort.assign_coords(fit_relative_reflectance=relative))
+    differences = frame[frame.quantity == "delta E"]
+    assert differences.value.isna().all()
+    assert differences.error.isna().all()
+
+
 def test_tidy__columns(cohort):
     frame = tidy(cohort)
     # 2 regions x 3 channels, 2 regions, 1 site x 3 channels, and 7 colours of 2 regions
