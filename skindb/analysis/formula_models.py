@@ -261,9 +261,10 @@ def _fit(model: MixedModel, rows: pd.DataFrame) -> _Fit:
     )
     names = [name for name in COLUMNS if name != variables.MODEL_P_FALSE_DISCOVERY]
     effects = [INTERCEPT, *model.slopes] if model.is_mixed else []
+    size = np.sqrt((random**2).mean(axis=0))  # whatever the units of the slopes are
     at_bound = [
         effect
-        for effect, value in zip(effects, spread, strict=False)
+        for effect, value in zip(effects, spread[:-1] * size, strict=True)
         if value**2 < BOUND * spread[-1] ** 2
     ]
     return _Fit(
@@ -298,10 +299,16 @@ def _solve(
     # takes a second to import
     from statsmodels.regression.mixed_linear_model import MixedLM
 
+    # solvers with gradients stop early at bounds, and others for columns of unlike size
+    x, of_x = np.linalg.qr(x)
+    random, of_random = np.linalg.qr(random)
+    scale = np.sqrt(len(y))
+    x, random = scale * x, scale * random
+    back, back_random = (scale * np.linalg.inv(part) for part in (of_x, of_random))
     with warnings.catch_warnings():
         # a variance at its bound 0, which is reported
         warnings.simplefilter("ignore")
-        fitted = MixedLM(y, x, groups=subjects, exog_re=random).fit(reml=True)
+        fitted = MixedLM(y, x, groups=subjects, exog_re=random).fit(method="powell")
     variance = float(fitted.scale)
     between = np.atleast_2d(np.asarray(fitted.cov_re, float))
     information = np.zeros((x.shape[1],) * 2)
@@ -310,8 +317,10 @@ def _solve(
         covariance = random[rows] @ between @ random[rows].T
         covariance += variance * np.eye(len(covariance))
         information += x[rows].T @ np.linalg.solve(covariance, x[rows])
+    between = back_random @ between @ back_random.T
     spread = np.sqrt([*np.maximum(np.diag(between), 0), variance])
-    return np.asarray(fitted.fe_params, float), np.linalg.inv(information), spread
+    estimate = back @ np.asarray(fitted.fe_params, float)
+    return estimate, back @ np.linalg.inv(information) @ back.T, spread
 
 
 def _labelled(

@@ -19,15 +19,20 @@ PEOPLE, VISITS = 24, 4
 FORMULA = "R_d ~ treatment * visit + age + (1 | subject)"
 
 
-def planted(*, effect=0.0, seed=5):
-    """Subjects at four visits; under cream, R_d rises by `effect` at each visit."""
+def planted(*, effect=0.0, slope=0.0, seed=5):
+    """Subjects at four visits; under cream, R_d rises by `effect` at each visit, and in
+    all by slopes with the standard deviation `slope`.
+    """
     rng = np.random.default_rng(seed)
     names = np.repeat([f"S{i:02d}" for i in range(PEOPLE)], VISITS)
     visit = np.tile(np.arange(1, VISITS + 1), PEOPLE)
     is_treated = np.repeat(np.arange(PEOPLE) % 2, VISITS)
     cohort = planted_tables(
         names.tolist(),
-        albedo=effect * is_treated * visit + rng.normal(0, 0.01, len(names)),
+        albedo=effect * is_treated * visit
+        + rng.normal(0, 0.01, len(names))
+        + visit
+        * np.repeat(slope * np.random.default_rng(2).normal(size=PEOPLE), VISITS),
         treatment=np.where(is_treated, "cream", "none"),
         age=np.repeat(rng.integers(20, 60, PEOPLE), VISITS),
     )
@@ -45,7 +50,9 @@ def by_statsmodels(cohort, formula, **options):
     ]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return smf.mixedlm(formula, rows, groups="subject", **options).fit(reml=True)
+        return smf.mixedlm(formula, rows, groups="subject", **options).fit(
+            method="powell"
+        )
 
 
 @pytest.mark.parametrize(
@@ -53,17 +60,17 @@ def by_statsmodels(cohort, formula, **options):
     [("(1 | subject)", {}), ("(1 + visit | subject)", {"re_formula": "visit"})],
 )
 def test_linear_model__has_the_numbers_of_statsmodels(random, options):
-    """The solvers stop at other places: 0.1 % of the estimates' errors is allowed, and 1 %
-    of the errors, which statsmodels takes from the curvature.
+    """The solvers stop at other places: 0.1 % of the estimates' errors is allowed, and 3 %
+    of the errors, as statsmodels takes them from the curvature in all parameters.
     """
-    cohort = planted(effect=0.002).isel(region=[0])
+    cohort = planted(effect=0.002, slope=0.01).isel(region=[0])
     ours = linear_model(cohort, formula=f"R_d ~ treatment * visit + age + {random}")
     ours = ours.sel(quantity="R_d face G")
     theirs = by_statsmodels(cohort, "value ~ treatment * visit + age", **options)
     terms = ours["term"].values.tolist()
     assert set(terms) == set(theirs.fe_params.index)
     error = theirs.bse_fe[terms]
-    np.testing.assert_allclose(ours["model_error"], error, rtol=0.01)
+    np.testing.assert_allclose(ours["model_error"], error, rtol=0.03)
     change = ours["model_estimate"].values - theirs.fe_params[terms]
     assert (np.abs(change) < 1e-3 * error).all()
     deviation = ours["model_deviation"].sel(effect=["Intercept", "residual"]).values
@@ -73,6 +80,24 @@ def test_linear_model__has_the_numbers_of_statsmodels(random, options):
     p = 2 * stats.t.sf(t, ours["model_degrees_of_freedom"])
     np.testing.assert_allclose(ours["model_p"], p)
     assert (int(ours["model_takes"]), int(ours["model_subjects"])) == (96, 24)
+
+
+@pytest.mark.parametrize(("unit", "start"), [(30.0, 0.0), (1e4, 0.0), (1.0, 2026.0)])
+def test_linear_model__units_and_origin_of_a_slope_change_no_inference(unit, start):
+    """Rounding of the origin 2026, squared, leaves 1e-9."""
+    rng = np.random.default_rng(3)
+    subject = np.repeat(np.arange(20), 4)
+    time = np.tile([0.0, 1.0, 2.0, 3.0], 20)
+    value = rng.normal(0, 1, 20)[subject] + rng.normal(0, 1, 20)[subject] * time
+    rows = pd.DataFrame({"subject": subject.astype(str), "time": time})
+    rows["value"] = value + rng.normal(0, 0.5, 80)
+    model = MixedModel.of("R_d ~ time + (1 + time | subject)")
+    fits = [_fit(model, rows), _fit(model, rows.assign(time=unit * time + start))]
+    t = [fit.table["model_estimate"] / fit.table["model_error"] for fit in fits]
+    np.testing.assert_allclose(t[1]["time"], t[0]["time"], rtol=1e-9)
+    slopes = [fit.deviation["time"] for fit in fits]
+    np.testing.assert_allclose(unit * slopes[1], slopes[0], rtol=1e-6)
+    assert fits[0].flags == fits[1].flags == ()
 
 
 def test_linear_model__degrees_of_freedom_by_hand():
