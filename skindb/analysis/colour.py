@@ -14,6 +14,7 @@ import numpy as np
 from skindb.types import Array, float64
 
 STEP = 1e-3  # of derivatives, relative to R_d
+MIN_YELLOW = 1.0  # b*, which is 5 to 30 of skin and 0 of grey captures
 # lower limit of the individual typology angle [degree], class (Del Bino and Bernerd 2013),
 # and the phototype of Fitzpatrick that usually has it
 ITA_CLASSES = (
@@ -39,10 +40,12 @@ def cielab(reflectance: Array) -> Array:
 
 def typology_angle(reflectance: Array) -> Array:
     """Individual typology angle (...) of R_d (..., 3) [degree]: arctan((L* - 50) / b*)
-    (Chardon et al. 1991, International Journal of Cosmetic Science 13, 191).
+    (Chardon et al. 1991, International Journal of Cosmetic Science 13, 191); NaN for
+    what is as little yellow as no skin.
     """
     lab = cielab(reflectance)
-    return np.degrees(np.arctan2(lab[..., 0] - 50, lab[..., 2]))
+    yellow = np.where(lab[..., 2] > MIN_YELLOW, lab[..., 2], np.nan)
+    return np.degrees(np.arctan((lab[..., 0] - 50) / yellow))
 
 
 def melanin_index(reflectance: Array) -> Array:

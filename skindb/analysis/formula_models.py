@@ -29,6 +29,7 @@ from skindb.analysis.study import (
 )
 from skindb.analysis.subjects import CONDITION, NORMAL
 from skindb.errors import InputError, input_error, require
+from skindb.numerics.statistics import ROUNDING
 from skindb.parameters import option
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
@@ -217,6 +218,7 @@ def _fit(model: MixedModel, rows: pd.DataFrame) -> _Fit:
         raise input_error("formula", "must fit the data", f"{broken}"[:200]) from None
     x = np.asarray(design, float)
     terms = [str(name) for name in design.columns]
+    require(terms, "formula", "must have fixed terms", "no fixed term", EXAMPLE)
     is_between = np.array(
         [
             len({*zip(subjects, column, strict=True)}) == people
@@ -240,8 +242,20 @@ def _fit(model: MixedModel, rows: pd.DataFrame) -> _Fit:
         "must have (1 | subject) if subjects have several takes",
         f"{len(rows)} takes of {people} subjects without (1 | subject)",
     )
+    require(
+        not model.is_mixed or people < len(rows),
+        "formula",
+        "must have (1 | subject) only if subjects have several takes",
+        f"one take of each of {people} subjects",
+    )
     y = rows["value"].to_numpy(float)
-    scale = float(np.std(y)) or 1.0  # so that the solver converges
+    require(
+        np.ptp(y) > ROUNDING * np.abs(y).max(),
+        "formula",
+        "must explain values that differ",
+        f"the same in {len(rows)} takes",
+    )
+    scale = float(np.std(y))  # so that the solver converges
     random = np.column_stack(
         [np.ones(len(rows)), *(_numbers(rows, name) for name in model.slopes)]
     )

@@ -19,6 +19,7 @@ from skindb.analysis.quantities import (
     measurements,
 )
 from skindb.analysis.subjects import CONDITION, NORMAL, subjects_of
+from skindb.errors import require
 from skindb.schema.cohort import require_takes, visit_of
 from skindb.types import Array
 
@@ -83,6 +84,13 @@ def tidy(cohort: Dataset) -> pd.DataFrame:
     keys = (subjects.take, subjects.subject, conditions, visit, repeat)
     takes = pd.DataFrame(dict(zip(KEYS, keys, strict=True)) | attributes)
     measured = measurements(cohort)
+    require(
+        measured,
+        "cohort",
+        "must have regions or probe sites",
+        "neither",
+        "add landmarks or a probe to the captures",
+    )
     rows = [_rows(one) for one in [*measured, *_differences(measured, takes)]]
     table = takes.merge(pd.concat(rows), left_index=True, right_index=True)
     return table[[*KEYS, *COLUMNS, *attributes]].reset_index(drop=True)

@@ -22,7 +22,11 @@ from skindb.analysis.study import (
 )
 from skindb.analysis.subjects import CONDITION, NORMAL, subjects_of
 from skindb.errors import require
-from skindb.numerics.statistics import agreement_correlation, intraclass_correlation
+from skindb.numerics.statistics import (
+    ROUNDING,
+    agreement_correlation,
+    intraclass_correlation,
+)
 from skindb.parameters import option, quantities_option
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable, visit_of
@@ -133,7 +137,10 @@ def _statistics(
     statistics = dict.fromkeys(COLUMNS, np.nan)
     statistics[variables.REPEAT_SUBJECTS] = len(repeated)
     statistics[variables.REPEAT_TAKES] = int(known.sum())
-    if len(repeated) < MIN_SUBJECTS:
+    spread = np.ptp(values[known]) if known.any() else 0.0
+    if len(repeated) < MIN_SUBJECTS or spread <= ROUNDING * np.abs(values[known]).max(
+        initial=0
+    ):
         return statistics
     one_way = intraclass_correlation(values[known], subjects[known])
     columns = sorted(set(occasions))

@@ -205,3 +205,25 @@ def test_linear_model__no_variance_between_subjects_is_flagged():
 def test_linear_model__refuses(formula, said):
     with pytest.raises(InputError, match=said):
         linear_model(planted(), formula=formula)
+
+
+@pytest.mark.parametrize(
+    ("formula", "takes", "found"),
+    [
+        ("R_d ~ 0 + (1 | subject)", slice(None), "no fixed term"),
+        ("R_d ~ 1 + (1 | subject)", slice(0, None, VISITS), "one take of each of 24"),
+    ],
+)
+def test_linear_model__what_no_data_determine_is_one_line(formula, takes, found):
+    with pytest.raises(InputError, match=found):
+        linear_model(planted().isel(take=takes), formula=formula)
+
+
+def test_linear_model__values_that_do_not_differ_are_one_line():
+    cohort = planted()
+    same = cohort["region_diffuse_reflectance"] * 0 + 0.3
+    with pytest.raises(InputError, match="the same in 96 takes"):
+        linear_model(
+            cohort.assign(region_diffuse_reflectance=same),
+            formula="R_d ~ age + (1 | subject)",
+        )

@@ -120,3 +120,12 @@ def test_repeatability__too_few_subjects():
     table = repeatability(cohort)
     assert np.isnan(table["icc"].sel(quantity="R_d face R"))
     assert np.isfinite(table["icc"].sel(quantity="R_d beard R"))
+
+
+def test_repeatability__of_equal_values_is_unknown():
+    cohort = planted()
+    same = cohort["region_diffuse_reflectance"] * 0 + 0.3
+    table = repeatability(cohort.assign(region_diffuse_reflectance=same))
+    constant = table.sel(quantity="R_d face R")
+    assert np.isnan(constant["icc"])
+    assert np.isnan(constant["repeatability_coefficient"])

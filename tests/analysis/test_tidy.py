@@ -226,3 +226,18 @@ def test_tidy_command__writes_what_the_function_returns(tmp_path):
     assert db.audit()[0][-1].action == "tidy"
     refused = run(["tidy", db.url, "--out", str(tmp_path / "table.txt")])
     assert refused.exit_code != 0
+
+
+def test_typology_angle__grey_is_no_skin():
+    angle = typology_angle(
+        np.array([[0.4, 0.4, 0.4], [0.2, 0.3, 0.5], [0.5, 0.4, 0.3]])
+    )
+    assert np.isnan(angle[:2]).all()
+    assert np.isfinite(angle[2])
+
+
+def test_tidy__without_regions_and_sites_is_one_line(cohort):
+    bare = cohort.drop_vars([name for name in cohort if name.startswith("region_")])
+    bare = bare.drop_vars([name for name in bare if name.startswith("site_")])
+    with pytest.raises(InputError, match="must have regions or probe sites"):
+        tidy(bare)
