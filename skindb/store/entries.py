@@ -23,7 +23,7 @@ from skindb.store.record import Record, intact_or_none
 
 CATALOGUE = "catalogue"
 CATALOGUE_BLOCK = r"[0-9a-f]\.block"
-BLOCK_FORMAT = 7
+BLOCK_FORMAT = 8
 DIGEST_BYTES = 32  # before the content of a file of a cache
 # parts of a provenance that are equal in many records
 SHARED_PARTS = (
@@ -31,6 +31,7 @@ SHARED_PARTS = (
     "parameters",
     "dictionary",
     "dictionary_digest",
+    "relative_reflectance",
     "summary_parameters",
     "consent_scope",
     "calibration",

@@ -207,6 +207,9 @@ def test_relative_and_absolute_reflectance_are_not_mixed(
         path.write_text(json.dumps(dome | {"relative": name == "relative"}))
         skindb.workflow.ingest_take(db, folder, spacing_mm=8)
         skindb.workflow.fit_take(db, name)
+    for _ in range(2):  # the second time from the cache
+        unknown = db.cohort("tables")["fit_relative_reflectance"].values.tolist()
+        assert unknown == [False, True]  # absolute, relative
     with pytest.raises(InputError, match="relative: all takes of a study"):
         skindb.workflow.study(db, "correlations")
     with pytest.raises(InputError, match="needs absolute reflectance"):
