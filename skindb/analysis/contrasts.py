@@ -65,12 +65,10 @@ class Contrast:
     quantities: Quantities  # of the subjects, or differences within subjects
     regressor: Array  # (n,) compared attribute; 1 for differences within subjects
     covariates: Array  # (n, c)
+    reliability: Array  # (q,) of the subjects, see `Quantities.reliability`
     is_number: bool = False  # whether the compared attribute is numeric
     # (n, q) values in the condition normal, for differences within subjects
     before: Array | None = None
-    reliability: Array | None = (
-        None  # (q,) of the subjects, see `Quantities.reliability`
-    )
 
     @property
     def is_paired(self) -> bool:
@@ -130,8 +128,8 @@ def contrasts(
             quantities,
             regressor,
             covariates,
+            reliability,
             is_number,
-            reliability=reliability,
         ).complete()
         for name, regressor in regressors.items()
     ]
@@ -267,8 +265,8 @@ def _paired(
                 difference,
                 ones,
                 nothing,
+                normal.reliability,
                 before=before,
-                reliability=normal.reliability,
             )
         )
     require(

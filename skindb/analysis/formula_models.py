@@ -155,7 +155,7 @@ def linear_model(cohort: Dataset, *, formula: str) -> Dataset:
     if model.is_log:
         positive = frame["value"].where(frame["value"] > 0)
         frame = frame.assign(value=np.log(positive))
-    frame = frame.dropna(subset=["value", *used])
+    frame = _with_levels(model, frame.dropna(subset=["value", *used]))
     fits: dict[str, _Fit] = {}
     flags: list[str] = []
     for (region, channel), part in frame.groupby(
@@ -192,8 +192,7 @@ class _Fit:
 
 def _names(model: MixedModel, known: Sequence[str]) -> list[str]:
     """Columns that a model uses."""
-    words = {word.strip("`") for word in re.findall(NAME, model.fixed)} - {"C"}
-    names = sorted({*words, *model.slopes, SUBJECT})
+    names = sorted({*_words(model), *model.slopes, SUBJECT})
     if unknown := [name for name in names if name not in known]:
         raise input_error(
             f"formula: {', '.join(unknown)}",
@@ -202,6 +201,36 @@ def _names(model: MixedModel, known: Sequence[str]) -> list[str]:
             f"choose from: {', '.join(known)}",
         )
     return names
+
+
+def _with_levels(model: MixedModel, frame: pd.DataFrame) -> pd.DataFrame:
+    """The rows, with words and C(NAME) as categories, so that terms mean the same in
+    all regions.
+    """
+    words: dict[str, pd.Categorical] = {}
+    factors = re.findall(rf"C\(\s*({NAME})\s*\)", model.fixed)
+    factors = [name.strip("`") for name in factors]
+    for name in _words(model):
+        values = frame[name]
+        if pd.api.types.is_numeric_dtype(values) and name not in factors:
+            continue
+        kinds = sorted({type(value).__name__ for value in values})
+        require(
+            len(kinds) < 2,
+            f"formula: {name}",
+            "must be all numbers or all words",
+            f"values of {' and '.join(kinds)}",
+            "correct the attribute in capture.json, and ingest again",
+        )
+        words[name] = pd.Categorical(values)
+        require(
+            len(words[name].categories) != 1,
+            f"formula: {name}",
+            "must differ between takes",
+            f"{name} is {values.iloc[0]} in all of them" if len(values) else "",
+            "omit it",
+        )
+    return frame.assign(**words)
 
 
 def _fit(model: MixedModel, rows: pd.DataFrame) -> _Fit:
@@ -217,12 +246,21 @@ def _fit(model: MixedModel, rows: pd.DataFrame) -> _Fit:
     except (FormulaicError, ValueError, TypeError, SyntaxError) as broken:
         raise input_error("formula", "must fit the data", f"{broken}"[:200]) from None
     x = np.asarray(design, float)
-    terms = [str(name) for name in design.columns]
+    is_present = x.any(axis=0)  # levels that this region has
+    x = x[:, is_present]
+    terms = [str(name) for name in design.columns[is_present]]
     require(terms, "formula", "must have fixed terms", "no fixed term", EXAMPLE)
+    of_slopes = {
+        design.columns[column]
+        for term, columns in design.model_spec.term_indices.items()
+        if not {
+            str(name) for name in design.model_spec.term_variables[term]
+        }.isdisjoint(model.slopes)
+        for column in columns
+    }
     is_between = np.array(
         [
-            len({*zip(subjects, column, strict=True)}) == people
-            or not {*re.split(r"[:\[]", term)}.isdisjoint(model.slopes)
+            len({*zip(subjects, column, strict=True)}) == people or term in of_slopes
             for term, column in zip(terms, x.T, strict=True)
         ]
     )
@@ -379,7 +417,8 @@ def _labelled(
 
 
 def _words(model: MixedModel) -> set[str]:
-    return {word.strip("`") for word in re.findall(NAME, model.fixed)}
+    """Names in the fixed terms."""
+    return {word.strip("`") for word in re.findall(NAME, model.fixed)} - {"C"}
 
 
 def tabulate_model(table: Dataset) -> Table:

@@ -104,11 +104,11 @@ def group_effects(
         adjusted by the largest statistic, and by the false discovery rate); and the
         smallest detectable effect; and the reliability, the fraction of the variance
         between subjects that the errors of the fits and the differences between
-        repeated takes leave: where it is below 0.5, there are no p values. sigma_tr is
-        compared by its logarithm. NaN where too few subjects have a quantity. R_d may
-        be wrong by the same amount in all takes (even reflection): this cancels in
-        differences, and the intervals in per cent include it. Attribute "flags": small
-        or missing groups, confounded attributes, and low reliability.
+        repeated takes leave: where it is below 0.5, there are no p values between
+        subjects. sigma_tr is compared by its logarithm. NaN where too few subjects have
+        a quantity. R_d may be wrong by the same amount in all takes (even reflection):
+        this cancels in differences, and the intervals in per cent include it. Attribute
+        "flags": small or missing groups, confounded attributes, and low reliability.
 
     Raises
     ------
@@ -164,8 +164,7 @@ def _statistics(comparison: Comparison) -> dict[str, Array]:
     contrast = comparison.contrast
     test = comparison.test
     fit = test.effects
-    assert contrast.reliability is not None
-    is_low = contrast.reliability < MIN_RELIABILITY
+    is_low = _is_unreliable(contrast)
     p, p_adjusted = (np.where(is_low, np.nan, x) for x in (test.p, test.p_adjusted))
     percent, low, high = _percent(fit, _reference(contrast, fit), contrast.quantities)
     discovered = np.full(len(p), np.nan)
@@ -192,6 +191,15 @@ def _statistics(comparison: Comparison) -> dict[str, Array]:
         variables.EFFECT_RELIABILITY: contrast.reliability,
         variables.ATTRIBUTE_ASSOCIATION: np.array(list(comparison.associated.values())),
     }
+
+
+def _is_unreliable(contrast: Contrast) -> Array:
+    """Quantities (q,) that show errors more than subjects; changes within subjects do
+    not depend on how much these differ.
+    """
+    if contrast.is_paired:
+        return np.zeros(len(contrast.quantities.names), bool)
+    return np.asarray(contrast.reliability < MIN_RELIABILITY)
 
 
 def _reference(contrast: Contrast, fit: Effects) -> Array:
@@ -259,8 +267,10 @@ def _flags(comparison: Comparison, statistics: dict[str, Array]) -> list[str]:
     names = contrast.quantities.names
     if low := [
         f"{name} {value:.2f}"
-        for name, value in zip(names, reliability, strict=True)
-        if value < MIN_RELIABILITY
+        for name, value, is_low in zip(
+            names, reliability, _is_unreliable(contrast), strict=True
+        )
+        if is_low
     ]:
         flags.append(
             f"{contrast.name}: no p values where the reliability is below "

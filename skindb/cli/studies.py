@@ -327,11 +327,12 @@ def tidy(db: str, takes: tuple[str, ...], release: str | None, out: Path) -> Non
         private_file(out).write_text(text, encoding="utf-8")
     else:
         try:
-            table.to_parquet(private_file(out))
+            data = table.to_parquet()
         except ImportError:
             raise input_error(
                 str(out), "needs pyarrow", "none", "pip install pyarrow, or write .csv"
             ) from None
+        private_file(out).write_bytes(data)
     lines = [f"skipped: {line}" for line in skindb.schema.note_lines(skipped)]
     report = {"path": str(out), "rows": len(table), "skipped": skipped}
     emit(report, [f"{out}: {len(table)} rows", *lines])

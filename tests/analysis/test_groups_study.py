@@ -371,11 +371,13 @@ def test_group_effects__reliability_is_what_was_planted(stated, repeat, reliabil
     assert np.isfinite(effects["effect_p"].sel(quantity="R_d face R"))
 
 
-def test_group_effects__reliability_and_colour_of_conditions():
+@pytest.mark.parametrize("stated", [0.015, 0.027])
+def test_group_effects__reliability_and_colour_of_conditions(stated):
+    """Changes within subjects have p values even where subjects cannot be compared."""
     names = [f"S{i}" for i in range(30)]
     cohort = planted_tables(names * 2, conditions=["normal"] * 30 + ["lotion"] * 30)
     dims = ("take", "region", "channel")
-    error = np.full(cohort["region_diffuse_reflectance"].shape, 0.015)
+    error = np.full(cohort["region_diffuse_reflectance"].shape, stated)
     cohort = cohort.assign(region_diffuse_reflectance_error=(dims, error))
     effects = group_effects(
         cohort, group_by="condition", permutations=200, rng=np.random.default_rng(0)
@@ -386,9 +388,10 @@ def test_group_effects__reliability_and_colour_of_conditions():
     assert any(flag.endswith(said) for flag in effects.attrs["flags"])
     effects = effects.isel(contrast=0)
     normal = cohort["region_diffuse_reflectance"].values[:30, 0, 1]
-    expected = 1 - 0.015**2 / normal.var(ddof=1)
+    expected = 1 - stated**2 / normal.var(ddof=1)
     reliability = effects["effect_reliability"].sel(quantity="R_d face G")
     assert float(reliability) == pytest.approx(expected)
+    assert np.isfinite(effects["effect_p"].sel(quantity="R_d face G"))
     # without stated errors it is unknown, and p values remain
     name = "surface reflectance face"
     assert np.isnan(effects["effect_reliability"].sel(quantity=name))

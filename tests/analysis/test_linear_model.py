@@ -227,3 +227,56 @@ def test_linear_model__values_that_do_not_differ_are_one_line():
             cohort.assign(region_diffuse_reflectance=same),
             formula="R_d ~ age + (1 | subject)",
         )
+
+
+def test_linear_model__terms_mean_the_same_in_all_regions():
+    """The region "face" lacks the first of three levels, and "beard" the last one."""
+    cohort = planted().isel(take=slice(0, None, VISITS))
+    dose = np.array(["a none", "b low", "c high"])[np.arange(PEOPLE) % 3]
+    level = {"a none": 0.0, "b low": 0.1, "c high": 0.3}
+    values = cohort["region_diffuse_reflectance"].values.copy()
+    values += np.array([level[word] for word in dose])[:, None, None]
+    values[dose == "a none", 0] = np.nan
+    values[dose == "c high", 1] = np.nan
+    dims = cohort["region_diffuse_reflectance"].dims
+    cohort = planted_tables(
+        [f"S{i:02d}" for i in range(PEOPLE)], albedo=np.zeros(PEOPLE), dose=dose
+    ).assign(region_diffuse_reflectance=(dims, values))
+    table = linear_model(cohort, formula="R_d ~ dose")
+    # nothing to compare with in the face: no number instead of "high less low"
+    assert {name.split()[1] for name in table["quantity"].values.tolist()} == {"beard"}
+    assert any("face" in flag and "excluded" in flag for flag in table.attrs["flags"])
+    assert table["term"].values.tolist() == ["Intercept", "dose[T.b low]"]
+    effect = table["model_estimate"].sel(term="dose[T.b low]")
+    np.testing.assert_allclose(effect, 0.1, atol=0.02)  # noise of 0.01 and 16 subjects
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        (["one"] * PEOPLE, "x: must differ between takes"),
+        ([7, "much"] * (PEOPLE // 2), "x: must be all numbers or all words"),
+    ],
+)
+def test_linear_model__factors_that_are_none_are_one_line(values, said):
+    names = [f"S{i:02d}" for i in range(PEOPLE)]
+    rng = np.random.default_rng(1)
+    cohort = planted_tables(
+        names, albedo=rng.normal(0, 0.01, PEOPLE), x=np.array(values, object)
+    )
+    with pytest.raises(InputError, match=said):
+        linear_model(cohort, formula="R_d ~ x")
+
+
+def test_linear_model__slopes_of_any_name_have_degrees_of_freedom_between_subjects():
+    rng = np.random.default_rng(3)
+    rows = pd.DataFrame(
+        {
+            "subject": np.repeat([f"S{i}" for i in range(12)], 4),
+            "time: [d]": np.tile([0.0, 1.0, 2.0, 3.0], 12),
+            "value": rng.normal(0, 1, 48) + np.repeat(rng.normal(0, 1, 12), 4),
+        }
+    )
+    model = MixedModel.of("R_d ~ `time: [d]` + (1 + `time: [d]` | subject)")
+    free = _fit(model, rows).table["model_degrees_of_freedom"]
+    assert free.tolist() == [10, 10]
