@@ -464,7 +464,7 @@ def plot_model(table: Dataset, *, ax: Axes | None = None) -> Axes:
             ax,
             shown.sel(term=term, drop=True),
             variables.MODEL_ESTIMATE,
-            places + 0.6 * ((i + 0.5) / len(terms) - 0.5),
+            places - 0.6 * ((i + 0.5) / len(terms) - 0.5),
             table[variables.MODEL_P].sel(term=term).values < 0.05,
             colour=colour,
         )
