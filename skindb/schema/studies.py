@@ -626,15 +626,6 @@ COVERAGE_COUNT = declare(
     "int32 coverage/coverage_count(cell) [1]",
     "subjects with a value, or with all values of a crossing",
 )
-COVERAGE_UNKNOWN = declare(
-    "int32 coverage/coverage_unknown(attribute) [1]",
-    "subjects who do not say the attribute",
-)
-COVERAGE_ASSOCIATION = declare(
-    "float64 coverage/coverage_association(attribute, attribute_2) [1]",
-    "Cramer's V, multiple correlation or correlation of two attributes between subjects",
-    "Bergsma 2013",
-)
 
 # brdf_space
 GROUP_SUBJECT_COUNT = declare(

@@ -1,4 +1,4 @@
-"""Coverage reports of planted populations: counts, empty cells, and correlated attributes."""
+"""Coverage reports of planted populations: counts and empty cells."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import xarray as xr
 from scipy import stats
 
 from skindb.analysis import coverage_report, describe_coverage, plot_coverage
+from skindb.analysis.subjects import Attribute, multiple_correlation
 from skindb.errors import InputError
 from skindb.schema import ProbeStatus
 
@@ -112,75 +113,20 @@ def test_coverage_report__names_empty_and_small_cells(population):
     assert lines[0] == "36 subjects, 37 takes"
 
 
-def test_coverage_report__attributes_that_go_together():
-    n = 60
-    gender = ["male" if i % 2 else "female" for i in range(n)]
-    hair = ["short" if i % 2 else "long" for i in range(n)]
-    eyes = ["blue" if i // 2 % 2 else "brown" for i in range(n)]
-    age = [20.0 + i // 4 for i in range(n)]
-    weight = [60.0 + one for one in age]
-    report = coverage_report(
-        cohort_of(
-            list(range(n)), gender=gender, hair=hair, eyes=eyes, age=age, weight=weight
-        )
-    )
-    between = report["coverage_association"].to_pandas()
-    np.testing.assert_allclose(between, between.T)
-    assert between.loc["gender", "hair"] == pytest.approx(1.0)
-    assert between.loc["gender", "eyes"] == 0
-    assert between.loc["age", "weight"] == pytest.approx(1.0)
-    assert between.loc["gender", "age"] < 0.2
-    together = [flag for flag in report.attrs["flags"] if "are associated" in flag]
-    assert len(together) == 2
-    assert any(
-        flag.startswith(
-            "gender and hair are associated (Cramer's V 1.00): their effects"
-        )
-        for flag in together
-    )
-
-
-def test_coverage_report__cramers_v_is_bergsmas():
-    """Compared with Bergsma's formula and the chi-square statistic of SciPy."""
-    rng = np.random.default_rng(3)
-    a = rng.integers(3, size=200)
-    b = np.where(rng.random(200) < 0.4, a, rng.integers(4, size=200))
-    report = coverage_report(
-        cohort_of(list(range(200)), a=[f"a{x}" for x in a], b=[f"b{x}" for x in b])
-    )
-    table = np.array(
-        [[((a == x) & (b == y)).sum() for y in range(4)] for x in range(3)]
-    )
-    square = stats.chi2_contingency(table, correction=False).statistic / 200
-    corrected = max(0, square - 2 * 3 / 199)
-    want = np.sqrt(corrected / (min(3 - 4 / 199, 4 - 9 / 199) - 1))
-    assert float(
-        report["coverage_association"].sel(attribute="a", attribute_2="b")
-    ) == pytest.approx(want)
-    assert 0.1 < want < 0.9
-
-
-def test_coverage_report__multiple_correlation_of_a_number():
+def test_multiple_correlation__is_that_of_an_analysis_of_variance():
     rng = np.random.default_rng(4)
     group = np.repeat([0, 1, 2], 20)
     age = 30 + 8.0 * group + rng.normal(0, 5, 60)
-    report = coverage_report(
-        cohort_of(
-            list(range(60)), age=age.tolist(), site_of_birth=[f"g{x}" for x in group]
-        )
-    )
     f = stats.f_oneway(*(age[group == one] for one in range(3))).statistic
     plain = 2 * f / (2 * f + 57)
     want = np.sqrt(1 - (1 - plain) * 59 / 57)
-    assert float(
-        report["coverage_association"].sel(attribute="age", attribute_2="site_of_birth")
-    ) == pytest.approx(want)
+    columns = Attribute("place", tuple(f"g{x}" for x in group)).columns
+    assert multiple_correlation(age, columns) == pytest.approx(want)
 
 
 def test_coverage_report__nothing_is_said():
     report = coverage_report(cohort_of(["A", "B"]))
     assert counts_of(report) == {"condition: normal": 2}
-    assert report.sizes["attribute"] == 0
     assert [
         f"{name}: no subject has this attribute" in report.attrs["flags"]
         for name in ("gender", "ancestry", "age")
