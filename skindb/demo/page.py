@@ -1,16 +1,13 @@
-"""Pictures of all subjects at one exposure and one scale, and plots for light and dark pages."""
+"""Pictures of all subjects at one exposure and one scale."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
 
-from skindb import plots
 from skindb.geometry.rays import RayScene
 from skindb.render.image import auto_exposure, encode_srgb, tone_map
 from skindb.render.photographs import Comparison, side_by_side
@@ -26,12 +23,6 @@ from skindb.render.shading import View, shade_view, trace_view
 from skindb.schema import variables
 from skindb.types import Array, Bytes, Mask, lengths, unit
 
-if TYPE_CHECKING:
-    import xarray as xr
-    from matplotlib.axes import Axes
-
-    from skindb.virtual.capture import Recovery
-
 Image = Array
 Picture = Bytes
 ERRORS = (  # maps of residuals, black where they are unknown
@@ -41,9 +32,6 @@ ERRORS = (  # maps of residuals, black where they are unknown
 # directions of the two lights of a portrait
 KEY_LIGHTS = ((-0.5, 0.35, 0.8), (0.55, 0.25, 0.8))
 MARGIN = 6  # pixels around a face
-SIZE = (4.4, 3.3)  # inches; text is still readable at 360 px, the width of a phone
-DOTS = 160  # per inch, twice the resolution of a page of 360 px
-INK = "#8a847c"  # of text and lines, readable on light and on dark pages
 
 
 @dataclass(frozen=True)
@@ -174,67 +162,3 @@ def _scaled(values: Image, top: float) -> Image:
 
 def _byte(image: Image) -> Picture:
     return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
-
-
-def plot_png(ax: Axes) -> bytes:
-    """A plot as PNG with its legend below and without a background; the figure is closed."""
-    from matplotlib import pyplot
-
-    handles, _ = ax.get_legend_handles_labels()
-    if handles:
-        ax.legend(
-            fontsize=8,
-            loc="upper center",
-            bbox_to_anchor=(0.5, -0.18),
-            ncol=2 if len(handles) < 5 else 3,
-            frameon=False,
-            labelcolor=INK,
-        )
-    ax.tick_params(colors=INK, which="both")
-    figure = ax.get_figure(root=True)
-    assert figure is not None
-    buffer = io.BytesIO()
-    figure.savefig(buffer, dpi=DOTS, bbox_inches="tight", transparent=True)
-    pyplot.close(figure)
-    return buffer.getvalue()
-
-
-def axes() -> Axes:
-    """Axes of a plot for the page."""
-    from matplotlib import pyplot, rc_context
-
-    names = ("axes.edgecolor", "axes.labelcolor", "text.color")
-    with rc_context(dict.fromkeys(names, INK)):
-        ax: Axes = pyplot.figure(figsize=SIZE).add_subplot()
-    return ax
-
-
-def reflectance_plot(recovered: Mapping[str, Recovery]) -> bytes:
-    """Plot of recovered against true diffuse reflectance, for every fortieth fitted
-    surfel of all takes.
-    """
-    ax = axes()
-    for channel, (name, colour) in enumerate(zip("RGB", plots.CHANNELS, strict=True)):
-        true = []
-        recovered_values = []
-        for recovery in recovered.values():
-            pick = np.flatnonzero(recovery.fitted)[::40]
-            true.append(recovery.true_diffuse[pick, channel])
-            recovered_values.append(
-                true[-1] * (1 + recovery.diffuse_error[pick, channel])
-            )
-        ax.plot(
-            np.concatenate(true),
-            np.concatenate(recovered_values),
-            ".",
-            ms=2,
-            color=colour,
-            alpha=0.5,
-        )
-        # the points are too small for a legend
-        ax.plot([], [], "o", ms=4, color=colour, label=name)
-    top = ax.get_xlim()[1]
-    ax.plot([0, top], [0, top], color=INK, lw=0.7, label="equal")
-    ax.set_xlabel("true diffuse reflectance R_d [1]")
-    ax.set_ylabel("recovered R_d [1]")
-    return plot_png(ax)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from skindb import workflow
-from skindb.demo.report import VIEWER, Results, write_report
+from skindb.demo.report import PLOTS, VIEWER, Results, write_report
 from skindb.elementwise import thread_count
 from skindb.errors import input_error
 from skindb.export.bundle import export_bundle
@@ -39,7 +39,7 @@ def run_demo(
     Parameters
     ----------
     out
-        Folder for captures/, db/, export/, the viewer and report.html. It must be
+        Folder for captures/, db/, export/, plots/, the viewer and report.html. It must be
         absent, empty or from an earlier demo, which is replaced.
     progress
         Called with the stage, the number of finished steps and the total number of steps.
@@ -148,7 +148,7 @@ def _remove_earlier_demo(out: Path) -> None:
             ", ".join(added),
             "choose another --out, or move the database",
         )
-    for name in ("captures", "db", "export"):
+    for name in ("captures", "db", "export", PLOTS):
         shutil.rmtree(out / name, ignore_errors=True)
     for name in ("report.html", VIEWER):
         (out / name).unlink(missing_ok=True)
