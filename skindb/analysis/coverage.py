@@ -247,10 +247,12 @@ def plot_coverage(report: Dataset, *, ax: Axes | None = None) -> Axes:
     """
     from matplotlib.colors import LogNorm
 
-    cells = [tuple(name.split(AND)) for name in report["cell"].values.tolist()]
+    cells: list[Words] = [tuple(name.split(AND)) for name in report["cell"].values]
     numbers = report[variables.COVERAGE_COUNT].values.tolist()
     count_of = dict(zip(map(frozenset, cells), numbers, strict=True))
-    bands = [c for c in cells if len(c) == 1 and c[0].startswith(f"{AGE_BAND}: ")]
+    bands: list[Words] = [
+        c for c in cells if len(c) == 1 and c[0].startswith(f"{AGE_BAND}: ")
+    ]
     columns: list[Words] = bands or [()]
     rows = [
         cell

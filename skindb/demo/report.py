@@ -72,7 +72,8 @@ def write_report(path: Path, results: Results, *, progress: Progress) -> Path:
     portraits = draw_portraits(results.models)
     counts = {
         take: np.bincount(
-            model[f"fitted/{variables.FIT_STATUS}"].values, minlength=len(FitStatus)
+            model["fitted"].to_dataset()[variables.FIT_STATUS].values,
+            minlength=len(FitStatus),
         )
         for take, model in results.models.items()
     }
@@ -89,7 +90,9 @@ def write_report(path: Path, results: Results, *, progress: Progress) -> Path:
         "takes": _takes(results, portraits, counts),
         "statuses": [
             (_spaced(status.name.lower()), status.explanation, count)
-            for status, count in zip(FitStatus, sum(counts.values()), strict=True)
+            for status, count in zip(
+                FitStatus, np.sum([*counts.values()], axis=0), strict=True
+            )
             if count
         ],
         "photographs": sum(map(len, results.compared.values())),
