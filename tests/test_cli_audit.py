@@ -60,7 +60,7 @@ LOGGED = [
         ("S01",),
         {"gltf": True},
     ),
-    (("view", "{db}", "--out", "{out}/page"), "view", ALL, {}),
+    (("view", "{db}", "--out", "{out}/page.html"), "view", ALL, {}),
     (("view", "{db}", "--explain"), "view", ALL, {"explain": True}),
     (("consent", "{db}", "S02", "--scope", "fit"), "consent", ("S02",), {}),
     (("release", "{db}", "r1", "--take", "S02"), "release", ("S02",), {}),

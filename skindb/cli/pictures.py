@@ -271,7 +271,7 @@ def _label(text: str) -> tuple[str, str]:
 @click.option(
     "--out",
     type=PATH,
-    help="Self-contained page of one take (.html), or folder for the page of several.",
+    help="Self-contained page of the takes (.html).",
 )
 @options_of(ViewParameters)
 @PORT
@@ -318,12 +318,6 @@ def view(
         server = skindb.workflow.view_server(database, chosen, port=port, **options)
         serve(server, takes=chosen)
         return
-    if out.suffix == ".html":
-        require_one_take(out, chosen)
+    writable(out, ".html")
     report = skindb.workflow.view_takes(database, chosen, out, **options)
-    page = (
-        report["path"]
-        if out.suffix
-        else f"{out / 'index.html'}: serve the folder to open it"
-    )
-    emit(report, [page])
+    emit(report, [report["path"]])

@@ -9,7 +9,7 @@ import json
 import re
 import secrets
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from http import HTTPStatus
@@ -20,7 +20,7 @@ from string import Template
 from typing import Any
 
 from skindb.errors import InputError, input_error, system_fault
-from skindb.files import make_private, private_file
+from skindb.files import private_file
 
 SCRIPTS = (
     "session",
@@ -91,44 +91,9 @@ def embedded_json(value: Any) -> str:
     return json.dumps(value, allow_nan=False).replace("<", "\\u003c")
 
 
-def write_page(
-    out: Path, record: Mapping[str, Any], still: str, *, surroundings: str = OVERCAST
-) -> int:
-    """Write a self-contained page of one face and return its size in bytes;
-    `surroundings` names the environment.
-
-    Raises
-    ------
-    InputError
-        If the page would be larger than 30 MB.
-    """
-    take = str(record["about"]["attributes"]["take"])
-    faces = (
-        '<script type="application/json" '
-        f'id="face-{html.escape(take)}">{embedded_json(record)}</script>'
-    )
-    text = _page(
-        f"skindb: {take}",
-        [{"take": take, "title": take, "still": still}],
-        faces,
-        surroundings,
-    )
-    if (size := len(text.encode())) > MAX_PAGE_BYTES:
-        raise input_error(
-            str(out),
-            f"a page must have at most {MAX_PAGE_BYTES // 1_000_000} MB",
-            f"{size / 1e6:.0f} MB",
-            "fit with a larger --spacing",
-        )
-    private_file(out).write_text(text, encoding="utf-8")
-    return size
-
-
 @dataclass(frozen=True)
 class PagedFace:
-    """One of several faces of a page: its entry in the list of takes, and the data that
-    the page requests.
-    """
+    """A face of a page: its entry in the list of takes, and its data."""
 
     take: str
     title: str
@@ -152,40 +117,51 @@ class PagedFace:
         )
 
 
-def index_text(faces: Iterable[PagedFace], *, surroundings: str = OVERCAST) -> str:
-    """The page of several faces, which requests faces/<take>.json."""
+def index_text(
+    faces: Sequence[PagedFace], *, embedded: bool = False, surroundings: str = OVERCAST
+) -> str:
+    """The page of faces, which contains their data or requests faces/<take>.json;
+    `surroundings` names the environment.
+    """
     takes = [
         {"take": face.take, "title": face.title, "still": face.still} for face in faces
     ]
-    return _page("skindb viewer", takes, "", surroundings)
-
-
-def write_folder(
-    out: Path, faces: Iterable[PagedFace], *, surroundings: str = OVERCAST
-) -> None:
-    """Write index.html and faces/<take>.json for several faces, which browsers can only
-    read over HTTP.
-    """
-    make_private(out / "faces")
-    listed = list(faces)
-    for face in listed:
-        private_file(out / "faces" / f"{face.take}.json").write_bytes(face.data)
-    private_file(out / "index.html").write_text(
-        index_text(listed, surroundings=surroundings), encoding="utf-8"
-    )
-
-
-def _page(
-    title: str, takes: list[dict[str, str]], faces: str, surroundings: str
-) -> str:
+    scripts = [
+        f'<script type="application/json" id="face-{html.escape(face.take)}">'
+        f"{face.data.decode()}</script>"
+        for face in faces
+    ]
+    title = f"skindb: {faces[0].take}" if len(faces) == 1 else "skindb viewer"
     parts = {
         "title": html.escape(title),
         "approximations": APPROXIMATIONS,
         "surroundings": html.escape(surroundings),
         "takes": embedded_json(takes),
-        "faces": faces,
+        "faces": "\n".join(scripts) if embedded else "",
     }
     return page_text("page", [f"{name}.js" for name in SCRIPTS], parts)
+
+
+def write_page(
+    out: Path, faces: Iterable[PagedFace], *, surroundings: str = OVERCAST
+) -> int:
+    """Write a self-contained page of faces and return its size in bytes.
+
+    Raises
+    ------
+    InputError
+        If the page would be larger than 30 MB.
+    """
+    content = index_text([*faces], embedded=True, surroundings=surroundings).encode()
+    if len(content) > MAX_PAGE_BYTES:
+        raise input_error(
+            str(out),
+            f"a page must have at most {MAX_PAGE_BYTES // 1_000_000} MB",
+            f"{len(content) / 1e6:.0f} MB",
+            "name fewer takes, or fit with a larger --spacing",
+        )
+    private_file(out).write_bytes(content)
+    return len(content)
 
 
 @dataclass(frozen=True)

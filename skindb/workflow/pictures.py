@@ -32,7 +32,6 @@ from skindb.view.page import (
     PagedFace,
     PageServer,
     index_text,
-    write_folder,
     write_page,
 )
 from skindb.workflow.audit import logged
@@ -337,14 +336,14 @@ def view_takes(
     progress: Progress | None = None,
     **options: Any,
 ) -> dict[str, Any]:
-    """Write the page of a take to the file `out`, or of several into the folder `out`.
+    """Write a self-contained page of takes to the file `out` (.html).
 
     Parameters
     ----------
     db, takes
         Database with models of the takes.
     out
-        A file that ends in .html, or a folder.
+        A file that ends in .html.
     environment
         Light from all directions, an OpenEXR file; default an overcast sky.
     progress
@@ -356,22 +355,12 @@ def view_takes(
     Returns
     -------
     dict
-        path, takes, and of a file its bytes.
+        path, takes and bytes.
     """
     named = OVERCAST if environment is None else environment.name
     faces = _faces(db, takes, environment=environment, progress=progress, **options)
-    description = {"path": str(out), "takes": list(takes)}
-    if out.suffix == ".html":
-        [(record, still)] = faces
-        return description | {
-            "bytes": write_page(out, record, still, surroundings=named)
-        }
-    write_folder(
-        out,
-        [PagedFace.of(record, still) for record, still in faces],
-        surroundings=named,
-    )
-    return description
+    size = write_page(out, (PagedFace.of(*face) for face in faces), surroundings=named)
+    return {"path": str(out), "takes": list(takes), "bytes": size}
 
 
 @logged("view")
@@ -407,8 +396,7 @@ def view_server(
     named = OVERCAST if environment is None else environment.name
     records = _faces(db, takes, environment=environment, progress=progress, **options)
     faces = {
-        take: PagedFace.of(record, still)
-        for take, (record, still) in zip(takes, records, strict=True)
+        take: PagedFace.of(*face) for take, face in zip(takes, records, strict=True)
     }
 
     def index() -> bytes:

@@ -41,7 +41,6 @@ from skindb.view.page import (
     PagedFace,
     PageServer,
     index_text,
-    write_folder,
     write_page,
 )
 from tests.pictures import decode_srgb, render_view
@@ -63,7 +62,7 @@ def page_file(model, tmp_path_factory):
         model, take="S1", attributes={"age": 30}, traits=(Trait("tan", whole, half),)
     )
     path = tmp_path_factory.mktemp("view") / "face.html"
-    write_page(path, record, still_picture(model))
+    write_page(path, [PagedFace.of(record, still_picture(model))])
     return path
 
 
@@ -218,7 +217,7 @@ def test_page__light_from_all_directions_is_that_of_the_renderer(
         attributes={},
         environment=None if sky is None else environment,
     )
-    write_page(tmp_path / "face.html", record, "")
+    write_page(tmp_path / "face.html", [PagedFace.of(record, "")])
     about = record["about"]
     unit = (
         np.sum(about["surroundings"]["irradiance"])
@@ -344,7 +343,7 @@ def test_page__a_slider_ends_at_the_amount_of_its_trait(browser, model, tmp_path
         record = face_record(
             model, take="S1", attributes={}, traits=(Trait("tan", whole, half, amount),)
         )
-        write_page(tmp_path / "face.html", record, "")
+        write_page(tmp_path / "face.html", [PagedFace.of(record, "")])
         page = opened(browser, (tmp_path / "face.html").as_uri())
         slider = page.get_by_label("tan")
         assert {float(slider.get_attribute(name)) for name in ("min", "max")} == {
@@ -501,10 +500,16 @@ def test_index_text__subjects_are_switched(browser, faces):
         page.close()
 
 
-def test_write_folder__writes_what_the_server_serves(faces, tmp_path):
-    write_folder(tmp_path, faces)
-    assert (tmp_path / "index.html").read_text() == index_text(faces)
-    assert (tmp_path / "faces/S2.json").read_bytes() == faces[1].data
+@pytest.mark.slow
+def test_write_page__several_faces_in_one_file(browser, faces, tmp_path):
+    write_page(tmp_path / "faces.html", faces)
+    page = opened(browser, (tmp_path / "faces.html").as_uri())
+    page.get_by_label("Take").select_option(label="S2, age 40")
+    page.wait_for_function(
+        "() => document.getElementById('status').textContent.startsWith('S2')"
+    )
+    assert not page.problems
+    page.close()
 
 
 @pytest.mark.slow
@@ -516,7 +521,7 @@ def test_write_page__data_are_neither_markers_nor_the_end_of_a_script(
         "\u2028 $ $$ &lt;"
     )
     record = face_record(model, take="S1", attributes={"hair": text, text: 1})
-    write_page(tmp_path / "face.html", record, "", surroundings=text)
+    write_page(tmp_path / "face.html", [PagedFace.of(record, "")], surroundings=text)
     assert (tmp_path / "face.html").read_text().count("function readFace") == 1
     page = opened(browser, (tmp_path / "face.html").as_uri())
     assert page.title() == "skindb: S1"
