@@ -1,5 +1,5 @@
 """A few killed and stopped runs and power losses in every run of the tests;
-docs/reliability.md has many more.
+docs/reliability.md has many more, and those of workers of a cluster.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ RUNS = (
     "kill_fit --cases 3 --seed 3",
     "kill_withdraw --cases 2",
     "kill_backup --every 90",
-    "kill_cluster --cases 1 --seed 3",
     "stop_lease --cases 1",
     "race_lease --commits 16 --kills 3",
     "power_loss --every 150",
