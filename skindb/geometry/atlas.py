@@ -6,6 +6,7 @@ their gaps filled, and sampled.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,6 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from skindb.errors import input_error
-from skindb.geometry._texture_kernels import interpolate, pull, push, rasterise
 from skindb.geometry.mesh import (
     boundary_loops,
     edge_table,
@@ -32,6 +32,7 @@ from skindb.types import (
     Index32,
     Mask,
     dots,
+    finite_rows,
     float64,
     lengths,
 )
@@ -47,6 +48,9 @@ TRIANGLES_PER_BLOCK = 1 << 17  # takes 50 MB
 # relative to the summed products: the sign of a larger difference is correct (Shewchuk
 # 1997)
 CERTAIN = 3.4e-16
+EDGE = 1e-9  # texels; a texel centre on an edge belongs to both triangles
+TEXELS_PER_BLOCK = 1 << 14  # 300 bytes each
+TINY = np.finfo(np.float64).tiny
 Image = Float32
 
 
@@ -403,7 +407,30 @@ def rasterise_atlas(uv: Array, faces: Faces, size: int) -> tuple[Index32, Image]
     """
     face = np.full((size, size), -1, np.int32)
     weight = np.zeros((size, size, 3), np.float32)
-    rasterise(np.ascontiguousarray(uv, np.float64), _indices(faces), face, weight)
+    # texel centres become integers
+    corners = size * float64(uv)[faces] - 0.5
+    low = np.ceil(corners.min(axis=1) - EDGE).clip(0, size).astype(np.int64)
+    high = np.floor(corners.max(axis=1) + EDGE).clip(-1, size - 1).astype(np.int64)
+    sides = np.maximum(high + 1 - low, 0)
+    count = sides.prod(axis=1)
+    count[~(np.abs(signed_areas(uv, faces)) > 0)] = 0
+    blocks = np.flatnonzero(np.diff(np.cumsum(count) // TEXELS_PER_BLOCK)) + 1
+    # a texel under several triangles is written last by the first one
+    for block in np.split(np.arange(len(faces)), blocks)[::-1]:
+        triangle = np.repeat(block, count[block])[::-1]
+        first = np.repeat(np.cumsum(count[block]) - count[block], count[block])[::-1]
+        place = np.arange(len(first))[::-1] - first
+        row, column = np.divmod(place, sides[triangle, 0])
+        texel = low[triangle] + np.stack([column, row], axis=1)
+        parts = np.repeat(corners[triangle, None], 3, axis=1)
+        parts[:, [0, 1, 2], [0, 1, 2]] = texel[:, None]
+        area = np.subtract(*_area_products(parts.reshape(-1, 3, 2))).reshape(-1, 3)
+        share = area / area.sum(axis=1, keepdims=True)
+        inside = share.min(axis=1) >= -EDGE
+        column, row = texel[inside].T
+        face[row, column] = triangle[inside]
+        share = share[inside].clip(min=0)
+        weight[row, column] = share / share.sum(axis=1, keepdims=True)
     return face, weight
 
 
@@ -431,16 +458,17 @@ def atlas_values(
         (size, size): mean trust of the corners, 0 outside.
     """
     face, weight = raster
-    mixed, trusted = (np.ascontiguousarray(x, np.float32) for x in (values, trust))
+    known = np.where(trust[:, None] > 0, values, 0)
     image = np.zeros((*face.shape, values.shape[1]), np.float32)
     confidence: Image = np.zeros(face.shape, np.float32)
-    interpolate(face, weight, _indices(faces), trusted, mixed, image, confidence)
+    for row, triangle in enumerate(face):
+        corners = faces[triangle]  # of any triangle outside, where all weights are 0
+        trusted = float64(weight[row]) * trust[corners]
+        total = trusted.sum(axis=1)
+        mixed = np.einsum("nk,nkc->nc", trusted, known[corners])
+        image[row] = mixed / np.maximum(total, TINY)[:, None]
+        confidence[row] = total
     return image, confidence
-
-
-def _indices(faces: Faces) -> Index32:
-    """Convert to one type, so that kernels are compiled once."""
-    return np.ascontiguousarray(faces, np.int32)
 
 
 def push_pull(image: Array, confidence: Array) -> tuple[Image, Image]:
@@ -461,25 +489,39 @@ def push_pull(image: Array, confidence: Array) -> tuple[Image, Image]:
         (h, w): 1 where known; elsewhere that of the average it was filled from, 0 if
         nothing is known.
     """
-    filled = np.array(image, np.float32, order="C")
-    weight = np.nan_to_num(np.clip(np.asarray(confidence, np.float32), 0, 1))
-    for channel in range(filled.shape[-1]):
-        weight[~np.isfinite(filled[..., channel])] = 0
+    weight = np.nan_to_num(np.clip(float64(confidence), 0, 1))
+    weight[~finite_rows(image)] = 0
+    filled = np.full(image.shape, np.nan, np.float32)
     if not weight.any():
-        return np.full_like(filled, np.nan), weight
-    filled.reshape(-1, filled.shape[-1])[np.flatnonzero(weight == 0)] = 0
-    levels = [(filled, weight)]
-    while max(levels[-1][1].shape) > 1:
-        height, width = ((n + 1) // 2 for n in levels[-1][1].shape)
-        coarse = (
-            np.empty((height, width, filled.shape[2]), np.float32),
-            np.empty((height, width), np.float32),
-        )
-        pull(*levels[-1], *coarse)
-        levels.append(coarse)
-    for fine, coarse in zip(levels[-2::-1], levels[:0:-1], strict=True):
-        push(*fine, *coarse)
-    return filled, weight
+        return filled, weight.astype(np.float32)
+    weights = [weight]
+    while max(weights[-1].shape) > 1:
+        weights.append(np.minimum(_pulled(weights[-1]), 1))
+    for channel in range(image.shape[-1]):
+        levels = [np.where(weight > 0, float64(image[..., channel]), 0)]
+        for fine in weights[:-1]:
+            levels.append(_pulled(fine * levels[-1]) / np.maximum(_pulled(fine), TINY))
+        filled[..., channel] = _pushed(levels, weights)
+    known = _pushed([1.0] * (len(weights) - 1) + [weights[-1]], weights)
+    return filled, known.astype(np.float32)
+
+
+def _pulled(plane: Float64) -> Float64:
+    """Sums of 2 x 2 texels, fewer at an odd border."""
+    even = np.pad(plane, [(0, side % 2) for side in plane.shape])
+    return even[::2, ::2] + even[::2, 1::2] + even[1::2, ::2] + even[1::2, 1::2]
+
+
+def _pushed(levels: Sequence[Float64 | float], weights: list[Float64]) -> Float64:
+    """The finest level, each blended by its weights with the interpolated coarser one."""
+    out = float64(levels[-1])
+    for plane, weight in zip(levels[-2::-1], weights[-2::-1], strict=True):
+        for axis, side in enumerate(weight.shape):
+            near = np.arange(side) // 2
+            far = (near + np.arange(side) % 2 * 2 - 1).clip(0, out.shape[axis] - 1)
+            out = 0.75 * out.take(near, axis) + 0.25 * out.take(far, axis)
+        out += weight * (plane - out)
+    return out
 
 
 def bilinear(image: Array, pixels: Array) -> Float64:

@@ -88,7 +88,7 @@ def _plain(values):
 }
 FIT = SimpleNamespace(__module__="skindb.science", __qualname__="fit")
 NNLS = ("numerics/_nnls_kernels.py", "MIN_PIVOT = 1e-11", "MIN_PIVOT = 1e-12")
-TEXTURE = ("geometry/_texture_kernels.py", "0.0", "-0.0")
+TEXTURE = ("geometry/atlas.py", "0.75 * out", "0.5 * out")
 
 
 @pytest.fixture
