@@ -100,7 +100,7 @@ def set_stage(model) -> Stage:
     K = camera.K.copy()
     K[0, 0] = K[1, 1] = (K[0, 0] + K[1, 1]) / 2
     camera = replace(camera, K=K, distortion=np.zeros(5))
-    surface = from_model(model, fill=True)
+    surface = from_model(model)
     fitted = model["fitted"].to_dataset()
     scene = RayScene(surface.vertices, surface.faces)
     view = trace_view(surface, camera, samples=4, scene=scene)

@@ -214,7 +214,7 @@ def main(db: str, *, take: str | None = None) -> None:
     model = db.read("model", take or db.takes("model")[0])
     dome = model["dome"].to_dataset().load()
     surface, (camera, _), lights = (
-        from_model(model, fill=True),
+        from_model(model),
         chosen_camera(dome, None),
         lights_from_dome(dome),
     )

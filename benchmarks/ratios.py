@@ -298,7 +298,7 @@ def rendering(bench: Bench) -> list[Row]:
     """Efficiency 1 / (error^2 CPU time) of a picture under sky and sun, 64 rays a pixel."""
     db = skindb.open(bench.database())
     model = db.read("model", db.takes("model")[0])
-    surface = from_model(model, fill=True)
+    surface = from_model(model)
     camera, _ = chosen_camera(model["dome"].to_dataset().load(), None)
 
     def picture(samples: int, seed: int) -> Any:

@@ -240,7 +240,7 @@ def main(db: str, *, take: str | None = None, picture: Path | None = None) -> No
     database = skindb.open(db)
     model = database.read("model", take or database.takes("model")[0])
     dome = model["dome"].to_dataset().load()
-    surface = from_model(model, fill=True)
+    surface = from_model(model)
     camera, _ = chosen_camera(dome, None)
     lights = lights_from_dome(dome)
     one_light = Lighting(lights.select([0]))

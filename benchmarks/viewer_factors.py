@@ -43,9 +43,7 @@ def measure(grid: TableGrid) -> np.ndarray:
 def main(db: str, take: str = "") -> None:
     """Print memory, texture fetches and errors."""
     database = skindb.open(db)
-    surface = from_model(
-        database.read("model", take or database.takes("model")[0]), fill=True
-    )
+    surface = from_model(database.read("model", take or database.takes("model")[0]))
     tables = np.asarray(surface.model.table, np.float64)
     nh, nd, nphi, count = tables.shape
     weight = measure(TableGrid(nh, nd, nphi))

@@ -36,8 +36,8 @@ from skindb.errors import Fault, attempt, attempt_all, require
 from skindb.format.dome import (
     CameraRecord,
     DomeRecord,
-    Pinhole,
 )
+from skindb.geometry.camera import Pinhole
 from skindb.schema import GROUPS, dataset
 from skindb.types import Float32, Float64, finite_rows, float64, lengths
 

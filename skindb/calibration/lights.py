@@ -30,10 +30,10 @@ from skindb.format.dome import (
     CameraRecord,
     DomeRecord,
     LightRecord,
-    Pinhole,
     WhiteRecord,
 )
 from skindb.format.frames import CAMERA, LIGHT, filled, read_frame
+from skindb.geometry.camera import Pinhole
 from skindb.parameters import POSITION_ERROR_MM
 from skindb.schema import dataset
 from skindb.types import Float64, Mask, float64, lengths

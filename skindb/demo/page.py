@@ -60,7 +60,7 @@ def _frontal(
     model: xr.DataTree, *, scale: float
 ) -> tuple[Surface, View, RayScene, xr.Dataset]:
     dome = model["dome"].to_dataset().load()
-    surface = from_model(model, fill=True)
+    surface = from_model(model)
     scene = RayScene(surface.vertices, surface.faces)
     camera = cameras_from_dome(dome)[frontal_camera(dome)].scaled(scale)
     return surface, trace_view(surface, camera, samples=2, scene=scene), scene, dome

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from skindb.format.fields import IDENTIFIER, REQUIRED, Fields, shown, zoned_time
 from skindb.format.frames import (
@@ -26,7 +25,7 @@ from skindb.format.frames import (
     require_own_files,
 )
 from skindb.format.sensor import SensorRecord, read_sensor
-from skindb.geometry.camera import camera_centre, pixel_rays, project
+from skindb.geometry.camera import Pinhole
 from skindb.limits import (
     MAX_CAMERAS,
     MAX_FRAME_PIXELS,
@@ -34,7 +33,7 @@ from skindb.limits import (
     MAX_LIGHTS,
     MAX_SEQUENCE_STEPS,
 )
-from skindb.types import Float64, Index, float64
+from skindb.types import Float64, Index
 
 ROTATION_TOLERANCE = 1e-4  # of R R^T - 1: five digits in the file
 MAX_DISC_RADIUS_MM = 2_000.0  # mm: the largest soft boxes have a radius of 1 m
@@ -60,34 +59,6 @@ VIGNETTE_STEPS = 1000
 
 # of exposures that are taken as equal: EXIF rounds them
 EXPOSURE_RATIO = 1.02
-
-
-@dataclass(frozen=True)
-class Pinhole:
-    """Projection of a camera: `x_cam = R x + t`, distortion k1 k2 p1 p2 k3."""
-
-    K: Float64  # (3, 3) px
-    R: Float64  # (3, 3)
-    t: Float64  # (3,) mm
-    distortion: Float64  # (5,)
-
-    @property
-    def centre(self) -> Float64:
-        """Centre of projection (3,) in mm."""
-        return float64(camera_centre(self.R, self.t))
-
-    def project(self, points: ArrayLike) -> Float64:
-        """Pixels (..., 2) of points (..., 3) in mm; NaN behind the camera."""
-        return project(points, self.K, self.R, self.t, self.distortion)[0]
-
-    def rays(self, pixels: ArrayLike) -> Float64:
-        """Unit directions (..., 3) through pixels (..., 2)."""
-        return pixel_rays(pixels, self.K, self.R, self.distortion)
-
-    def pixel_width(self, point: Float64) -> float:
-        """Width [mm] of a pixel at the distance of a point."""
-        distance = float(np.linalg.norm(self.centre - point))
-        return distance / float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
 
 
 @dataclass(frozen=True)

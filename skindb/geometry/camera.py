@@ -4,6 +4,8 @@ pixel centres at integer + 0.5.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -11,6 +13,34 @@ from skindb.geometry._camera_kernels import undistorted
 from skindb.types import Array, Float64, float64
 
 UNDISTORT_TOLERANCE = 1e-10  # in units of the focal length: 1e-7 px
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """Projection of a camera: `x_cam = R x + t`, distortion k1 k2 p1 p2 k3."""
+
+    K: Float64  # (3, 3) px
+    R: Float64  # (3, 3)
+    t: Float64  # (3,) mm
+    distortion: Float64  # (5,)
+
+    @property
+    def centre(self) -> Float64:
+        """Centre of projection (3,) in mm."""
+        return camera_centre(self.R, self.t)
+
+    def project(self, points: ArrayLike) -> Float64:
+        """Pixels (..., 2) of points (..., 3) in mm; NaN behind the camera."""
+        return project(points, self.K, self.R, self.t, self.distortion)[0]
+
+    def rays(self, pixels: ArrayLike) -> Float64:
+        """Unit directions (..., 3) through pixels (..., 2)."""
+        return pixel_rays(pixels, self.K, self.R, self.distortion)
+
+    def pixel_width(self, point: Float64) -> float:
+        """Width [mm] of a pixel at the distance of a point."""
+        distance = float(np.linalg.norm(self.centre - point))
+        return distance / float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
 
 
 def camera_centre(R: ArrayLike, t: ArrayLike) -> Float64:

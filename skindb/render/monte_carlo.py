@@ -211,7 +211,7 @@ class _Painter:
         lights = lighting.lights
         choice = None
         if lights is not None and len(lights):
-            middle = surface.vertices[surface.known].mean(axis=0)
+            middle = surface.vertices.mean(axis=0)
             choice = LightChoice.of_lights(lights, middle)
         bounced = None
         if lights is not None and surface.inter_reflection:
@@ -329,10 +329,9 @@ class _Painter:
         independent estimate in each batch.
         """
         surface = self.surface
-        vertices = np.flatnonzero(surface.known)
-        points = surface.vertices[vertices]
-        normals = surface.normals[vertices]
-        received = np.zeros((len(vertices), 3))
+        points = surface.vertices
+        normals = surface.normals
+        received = np.zeros((len(points), 3))
         if self.lighting.lights is not None and len(self.lighting.lights):
             received += self._received_from_lights(
                 points, normals, self.lighting.lights, rng
@@ -341,9 +340,7 @@ class _Painter:
             received += self._received_from_environment(
                 points, normals, self.lighting.environment, rng
             )
-        out = np.zeros((len(surface.vertices), 3))
-        out[vertices] = received
-        return out
+        return received
 
     def _received_from_lights(
         self, points: Array, normals: Array, lights: Lights, rng: np.random.Generator

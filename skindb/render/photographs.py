@@ -42,7 +42,7 @@ SSIM_WINDOW = 7
 Float = Float64
 Image = Array
 MIN_REGION_PIXELS = 30  # below which a region is not compared
-# fraction of a pixel's rays that must meet known surface, to exclude silhouettes
+# fraction of a pixel's rays that must meet the surface, to exclude silhouettes
 MIN_COVERAGE = 0.999
 
 
@@ -202,7 +202,7 @@ def _compared(
     """Comparisons of the photographs whose cameras see the face."""
     photographs = _kept_photographs(capture)
     dome = capture["dome"].to_dataset()
-    surface = from_model(model, fill=True)
+    surface = from_model(model)
     if subsurface:
         require_translucency(surface)
     scene = RayScene(surface.vertices, surface.faces)

@@ -77,7 +77,7 @@ def radiance_of(
     """
     honour_consent(model.attrs, "export")
     dome = model["dome"].to_dataset().load()
-    surface = from_model(model, fill=True)
+    surface = from_model(model)
     if subsurface:
         require_translucency(surface)
     seen_by = chosen_camera(dome, camera)[0].scaled(scale)
@@ -214,7 +214,7 @@ def render(
     Dataset
         `radiance` (image_row, image_col, channel), linear Rec. 709, in the unit of the
         photographs or of the environment; `radiance_variance`, the variance of this
-        mean; `coverage` (image_row, image_col), the fraction of rays that meet known
+        mean; `coverage` (image_row, image_col), the fraction of rays that meet
         skin. Attributes: camera, lights, samples, relative_error (relative standard
         error of the picture), seconds, skipped.
 
@@ -291,7 +291,7 @@ def render_inputs(
         seen_by, names["camera"] = camera, "given"
     else:
         seen_by, names["camera"] = chosen_camera(dome, camera)
-    surface = from_model(model, fill=True)
+    surface = from_model(model)
     if subsurface:
         require_translucency(surface)
     sized = seen_by.scaled(scale)

@@ -17,6 +17,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from skindb.errors import input_error
+from skindb.geometry.camera import Pinhole
 from skindb.geometry.interreflection import bounce_transfer
 from skindb.geometry.mesh import vertex_normals
 from skindb.limits import MAX_PICTURE_PIXELS
@@ -78,30 +79,13 @@ class Surface:
             receivers=np.arange(len(self.vertices)),
         )
 
-    @property
-    def known(self) -> Mask:
-        """(v,) vertices with finite values; triangles with any other vertex occlude but
-        reflect no light.
-        """
-        finite = [finite_rows(x) for x in (self.normals, self.diffuse, self.parameters)]
-        return np.asarray(np.logical_and.reduce(finite), np.bool_)
-
 
 @dataclass(frozen=True)
-class Camera:
+class Camera(Pinhole):
     """Pinhole camera with OpenCV distortion; pixel centres at integer + 0.5."""
 
-    K: Array  # (3, 3) px
-    R: Array  # (3, 3), x_cam = R x + t
-    t: Array  # (3,) mm
-    distortion: Array  # (5,) k1 k2 p1 p2 k3
     width: int
     height: int
-
-    @property
-    def centre(self) -> Array:
-        """(3,) centre of projection in mm."""
-        return np.asarray(-self.R.T @ self.t)
 
     def scaled(self, factor: float) -> Camera:
         """The same view with `factor` times the pixels along each side.
@@ -180,17 +164,14 @@ def lights_from_dome(dome: xr.Dataset) -> Lights:
     return Lights(*(dome[name].values.astype(np.float64) for name in names))
 
 
-def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
-    """Surface of a fitted model, with the tables of its reduced basis.
+def from_model(model: xr.DataTree) -> Surface:
+    """Surface of a fitted model, with the tables of its reduced basis. Surfels without a fit
+    take the values of the nearest fitted one, so that pictures have no holes.
 
     Parameters
     ----------
     model
         Version of kind "model": groups fitted, mesh and basis.
-    fill
-        Whether surfels without a fit take the values of the nearest fitted one, so that
-        pictures have no holes. Otherwise their values are NaN, and they are black and
-        not part of the coverage.
 
     Returns
     -------
@@ -219,14 +200,9 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
             "see the report of the fit",
         )
     del values[variables.FIT_STATUS]
-    if fill:
-        nearest = _nearest(position, usable)
-        values = {name: value[nearest] for name, value in values.items()}
-    else:
-        values = {
-            name: np.where(usable[:, None], value, np.nan)
-            for name, value in values.items()
-        }
+    _, near = cKDTree(position[usable]).query(position)
+    nearest = np.flatnonzero(usable)[near]
+    values = {name: value[nearest] for name, value in values.items()}
     sigma_tr = values.get(variables.SIGMA_TR)
     return Surface(
         vertices=position.astype(np.float64),
@@ -262,11 +238,6 @@ def usable_surfels(values: dict[str, AnyArray]) -> Mask:
     for name in (variables.SHADING_NORMAL, variables.DIFFUSE_REFLECTANCE, "parameters"):
         good &= finite_rows(values[name])
     return good
-
-
-def _nearest(position: Array, usable: Mask) -> Index:
-    _, index = cKDTree(position[usable]).query(position)
-    return np.asarray(np.flatnonzero(usable)[index], np.int64)
 
 
 def subdivide_surface(surface: Surface, spacing: float, visible: Mask) -> Surface:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from skindb.errors import input_error
-from skindb.geometry.camera import pixel_rays
 from skindb.geometry.mesh import vertex_areas
 from skindb.geometry.rays import RayScene
 from skindb.optics.dipole_tree import subsurface_exitance
@@ -54,16 +53,14 @@ def transmitted_irradiance(
     / d^2 [mm-2].
 
     It is computed from the centre of each light, with its fall-off. It is zero if the
-    vertex faces away from the light, is in its shadow, or has no known normal.
+    vertex faces away from the light or is in its shadow.
     """
-    vertices = np.flatnonzero(surface.known)
-    points = surface.vertices[vertices]
-    normals = surface.normals[vertices]
-    out = np.zeros((len(surface.vertices), len(lights)), np.float32)
+    points = surface.vertices
+    out = np.empty((len(points), len(lights)), np.float32)
     for i in range(len(lights)):
         place = np.broadcast_to(lights.position[i], points.shape)
-        out[vertices, i] = received_light(
-            lights, i, place, points, normals, scene, surface.eta
+        out[:, i] = received_light(
+            lights, i, place, points, surface.normals, scene, surface.eta
         )
     return out
 
@@ -115,8 +112,8 @@ def exitances(
     Parameters
     ----------
     surface
-        Surface with `s` and `sigma_tr`; vertices without known values neither receive
-        nor send light.
+        Surface with `s` and `sigma_tr`; vertices where these are unknown neither
+        receive nor send light.
     lights
         Lights, which are all computed in one traversal of the octree.
     scene
@@ -191,7 +188,7 @@ def _exitances_from_irradiance(
         raise ValueError(
             "the surface must have s and sigma_tr for subsurface transport, found None"
         )
-    finite = surface.known & finite_rows(surface.s) & finite_rows(surface.sigma_tr)
+    finite = finite_rows(surface.s) & finite_rows(surface.sigma_tr)
     out = np.zeros((irradiance.shape[1], len(surface.vertices), 3), np.float32)
     out[:, finite] = subsurface_exitance(
         surface.vertices[finite],
@@ -222,7 +219,7 @@ class View:
 
     @property
     def coverage(self) -> Image:
-        """(h, w) fraction of each pixel's rays that meet a known surface facing the
+        """(h, w) fraction of each pixel's rays that meet a surface facing the
         camera: the alpha of the image.
         """
         count = np.bincount(
@@ -278,9 +275,8 @@ def trace_view(
     point of each. With `pixels` (h, w), only the rays of these pixels are traced; they
     do not depend on it.
 
-    Hits are discarded if the triangle is seen from behind, its shading normal faces
-    away, or a vertex has unknown reflectance. There the surface occludes but reflects
-    no light.
+    Hits are discarded if the triangle is seen from behind or its shading normal faces
+    away. There the surface occludes but reflects no light.
     """
     rays = RayScene(surface.vertices, surface.faces) if scene is None else scene
     offset = (np.arange(samples) + 0.5) / samples
@@ -297,7 +293,7 @@ def trace_view(
     if rng is not None:
         drawn = rng.random((camera.height * camera.width, samples**2, 2))
         place += ((drawn if pixels is None else drawn[traced]) - 0.5) / samples
-    direction = pixel_rays(place.reshape(-1, 2), camera.K, camera.R, camera.distortion)
+    direction = camera.rays(place.reshape(-1, 2))
     face, barycentric, _ = rays.first_hit(
         np.broadcast_to(camera.centre, direction.shape), direction
     )
@@ -305,18 +301,17 @@ def trace_view(
     corners = np.asarray(surface.faces)[face[hit]].astype(np.int64)
     weight = barycentric[hit]
     position, normal, towards, facing = _facing_points(surface, camera, corners, weight)
-    keep = facing & surface.known[corners].all(axis=1)
-    pixel, ray = np.divmod(hit[keep], samples**2)
+    pixel, ray = np.divmod(hit[facing], samples**2)
     return View(
         camera,
         samples,
         traced[pixel],
         ray,
-        corners[keep],
-        weight[keep],
-        position[keep],
-        normal[keep],
-        towards[keep],
+        corners[facing],
+        weight[facing],
+        position[facing],
+        normal[facing],
+        towards[facing],
     )
 
 

@@ -216,7 +216,7 @@ def _surface(
     model: xr.DataTree, *, edited: bool
 ) -> tuple[Surface, tuple[Omission, ...]]:
     """The surface of the page, without unused bases unless it is edited, and what was omitted."""
-    surface = from_model(model, fill=True)
+    surface = from_model(model)
     if edited:
         return surface, ()
     fewer, parameters, omissions = surface.model.simplified(surface.parameters)
@@ -288,7 +288,7 @@ def _trait(trait: Trait, plain: Mapping[str, Array]) -> dict[str, Any]:
     """Change of the arrays by a trait: differences of weights, log ratios of albedo and
     diffusion length.
     """
-    edited = (from_model(tree, fill=True) for tree in (trait.whole, trait.half))
+    edited = (from_model(tree) for tree in (trait.whole, trait.half))
     full, half = (
         _values(surface, surface.model.resample(surface.parameters)[1])
         for surface in edited

@@ -13,7 +13,6 @@ import imagecodecs
 import numpy as np
 
 from skindb.files import make_private, private_file
-from skindb.geometry.camera import pixel_rays
 from skindb.geometry.rays import RayScene
 from skindb.parameters import require_sizes
 from skindb.render.scene import Camera, Lights, Surface
@@ -44,16 +43,10 @@ TARGET_NORMAL = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
-class DomeCamera:
-    """A pinhole camera with OpenCV distortion; x_cam = R x + t, pixel centres at integer + 0.5."""
+class DomeCamera(Camera):
+    """A camera of the dome."""
 
     name: str
-    width: int
-    height: int
-    matrix: Float64  # (3, 3) pixel
-    rotation: Float64  # (3, 3)
-    translation: Float64  # (3,) mm
-    distortion: Float64  # (5,) k1 k2 p1 p2 k3
     vignette: Float64  # (3,) a2 a4 a6
     polariser: str | None = None  # "left" or "right", circular
 
@@ -61,11 +54,6 @@ class DomeCamera:
     def polarisation(self) -> float:
         """Degree of circular polarisation of the light that it sees, 1 right-handed."""
         return DEGREES[self.polariser]
-
-    @property
-    def position(self) -> Float64:
-        """Centre of projection (3,) mm."""
-        return np.asarray(-self.rotation.T @ self.translation)
 
 
 @dataclass(frozen=True)
@@ -212,9 +200,8 @@ def _camera(
         [rng.normal(-0.1, 0.05), rng.normal(0.02, 0.05), *rng.normal(0, 5e-4, 2), 0.0]
     )
     shade = np.array([rng.normal(-0.10, 0.01), rng.normal(0.02, 0.003), 0.0])
-    return DomeCamera(
-        f"c{index:02d}", width, height, k, rotation, -rotation @ eye, lens, shade
-    )
+    name = f"c{index:02d}"
+    return DomeCamera(k, rotation, -rotation @ eye, lens, width, height, name, shade)
 
 
 def _look_at(eye: Float64, target: Float64, roll: float) -> Float64:
@@ -339,7 +326,7 @@ def photograph(
         camera: DomeCamera, camera_rng: np.random.Generator, stream: np.random.Generator
     ) -> None:
         pattern = sensor.pattern((camera.height, camera.width, 3), rng=camera_rng)
-        view = trace_view(surface, _render_camera(camera), scene=scene)
+        view = trace_view(surface, camera, scene=scene)
         terms = partial(shade_view, view, surface, lights, scene, disc_samples=1)
         if camera.polariser is None:
             images = terms(subsurface=subsurface, glow=glow)
@@ -388,7 +375,7 @@ class _FrameWriter:
         # loss of light (h, w, 1) towards the corners, 1 at the principal point
         y, x = np.mgrid[: camera.height, : camera.width] + 0.5
         half = np.hypot(camera.width, camera.height) / 2
-        r2 = ((x - camera.matrix[0, 2]) ** 2 + (y - camera.matrix[1, 2]) ** 2) / half**2
+        r2 = ((x - camera.K[0, 2]) ** 2 + (y - camera.K[1, 2]) ** 2) / half**2
         a2, a4, a6 = camera.vignette
         self.gain = np.asarray(1 + r2 * (a2 + r2 * (a4 + r2 * a6)), np.float32)[
             ..., None
@@ -419,18 +406,11 @@ def render_lights(dome: Dome) -> Lights:
     )
 
 
-def _render_camera(camera: DomeCamera) -> Camera:
-    c = camera
-    return Camera(c.matrix, c.rotation, c.translation, c.distortion, c.width, c.height)
-
-
 def frontal_camera(dome: Dome) -> DomeCamera:
     """The camera that sees the white target most frontally."""
     return max(
         dome.cameras,
-        key=lambda c: float(
-            (c.position - CENTRE)[2] / np.linalg.norm(c.position - CENTRE)
-        ),
+        key=lambda c: float((c.centre - CENTRE)[2] / np.linalg.norm(c.centre - CENTRE)),
     )
 
 
@@ -440,9 +420,9 @@ def _target_radiances(
     """A Lambertian white square in the middle of the dome, alone, under each light."""
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     pixels = np.stack([x, y], axis=-1).reshape(-1, 2)
-    ray = pixel_rays(pixels, camera.matrix, camera.rotation, camera.distortion)
-    reach = ((CENTRE - camera.position) @ TARGET_NORMAL) / (ray @ TARGET_NORMAL)
-    point = camera.position + reach[:, None] * ray
+    ray = camera.rays(pixels)
+    reach = ((CENTRE - camera.centre) @ TARGET_NORMAL) / (ray @ TARGET_NORMAL)
+    point = camera.centre + reach[:, None] * ray
     inside = np.flatnonzero(
         (np.abs((point - CENTRE)[:, :2]) <= TARGET_HALF_SIZE).all(axis=1)
     )

@@ -26,8 +26,7 @@ from skindb.calibration.lights import (
 )
 from skindb.calibration.setup import read_calibration_frames, read_setup_dome
 from skindb.errors import InputError
-from skindb.format.dome import Pinhole
-from skindb.geometry.camera import camera_centre, project
+from skindb.geometry.camera import Pinhole, camera_centre, project
 
 PUBLISHED = Path(__file__).resolve().parents[3] / "shared/data/photometric/uw"
 BALL_RADIUS = 25.0  # mm

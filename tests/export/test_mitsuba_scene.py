@@ -100,7 +100,7 @@ def of_model(model: xr.DataTree) -> Surface:
     # which direct light does not need
     fitted["dipole_s"] = fitted["diffuse_reflectance"].copy()
     model["fitted"] = fitted
-    return from_model(model, fill=True)
+    return from_model(model)
 
 
 def test_bundle__read_back_gives_the_same_picture(

@@ -67,20 +67,13 @@ def test_from_model__carries_every_value() -> None:
         surface.model.table[..., 1], tree["basis/basis_brdf"].values[1, ..., :-1]
     )
     assert surface.eta == 1.35
-    assert surface.known.all()
     assert surface.sigma_tr is not None
     assert from_model(model([0] * 5, translucent=False)).sigma_tr is None
 
 
-def test_from_model__surfels_without_a_fit_are_unknown_or_filled_from_the_nearest() -> (
-    None
-):
+def test_from_model__surfels_without_a_fit_are_filled_from_the_nearest() -> None:
     tree = model([0, 0, 0, int(FitStatus.UNSEEN), int(FitStatus.NOT_FINITE)])
-    np.testing.assert_array_equal(
-        from_model(tree).known, [True, True, True, False, False]
-    )
-    filled = from_model(tree, fill=True)
-    assert filled.known.all()
+    filled = from_model(tree)
     # (0, 20) is nearest to (10, 10)
     np.testing.assert_array_equal(filled.diffuse[4], filled.diffuse[2])
     np.testing.assert_array_equal(filled.vertices[4], [0, 20, 0])

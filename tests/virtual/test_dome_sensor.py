@@ -24,13 +24,11 @@ def test_build_dome__any_size_frames_the_head_and_keeps_lights_in_front(
         0.95,
     ]
     for camera in dome.cameras:
-        np.testing.assert_allclose(
-            camera.rotation @ camera.rotation.T, np.eye(3), atol=1e-12
-        )
-        assert np.linalg.det(camera.rotation) > 0
-        x = head @ camera.rotation.T + camera.translation
+        np.testing.assert_allclose(camera.R @ camera.R.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(camera.R) > 0
+        x = head @ camera.R.T + camera.t
         assert (x[:, 2] > 0).all()
-        pixel = x[:, :2] / x[:, 2:] * np.diag(camera.matrix)[:2] + camera.matrix[:2, 2]
+        pixel = x[:, :2] / x[:, 2:] * np.diag(camera.K)[:2] + camera.K[:2, 2]
         assert (pixel > -4).all()  # lens distortion and the aim's deviation
         assert (pixel < np.array([camera.width, camera.height]) + 4).all()
     for light in dome.lights:
@@ -41,8 +39,7 @@ def test_build_dome__any_size_frames_the_head_and_keeps_lights_in_front(
 def test_build_dome__up_in_the_world_is_up_in_the_image():
     for camera in _dome(lights=3, cameras=8).cameras:
         low, high = (
-            camera.rotation @ (CENTRE + np.array([0, y, 0])) + camera.translation
-            for y in (-50, 50)
+            camera.R @ (CENTRE + np.array([0, y, 0])) + camera.t for y in (-50, 50)
         )
         assert high[1] / high[2] < low[1] / low[2]
 
@@ -53,7 +50,7 @@ def test_build_dome__the_same_seed_is_the_same_device():
     for a, b in zip(first.lights, second.lights, strict=True):
         np.testing.assert_array_equal(a.position, b.position)
     for c, d in zip(first.cameras, second.cameras, strict=True):
-        np.testing.assert_array_equal(c.matrix, d.matrix)
+        np.testing.assert_array_equal(c.K, d.K)
 
 
 def test_build_dome__no_camera_looks_past_a_light_in_its_way():
@@ -63,7 +60,7 @@ def test_build_dome__no_camera_looks_past_a_light_in_its_way():
         for p in (x.position for x in dome.lights)
     ]
     for camera in dome.cameras:
-        eye = (camera.position - CENTRE) / np.linalg.norm(camera.position - CENTRE)
+        eye = (camera.centre - CENTRE) / np.linalg.norm(camera.centre - CENTRE)
         # a disc's radius is 0.8 degrees
         assert np.degrees(np.arccos(max(u @ eye for u in unit))) > 1.0
 

@@ -111,8 +111,8 @@ def test_simulate_take__white_frames_give_the_true_intensities(capture):
         true = truth["light_intensity"]
     white = dome["white"]
     camera = frontal_camera(DOME)
-    centre = camera.rotation @ np.array(white["point"]) + camera.translation
-    x, y = np.floor((camera.matrix @ centre)[:2] / centre[2]).astype(int)
+    centre = camera.R @ np.array(white["point"]) + camera.t
+    x, y = np.floor((camera.K @ centre)[:2] / centre[2]).astype(int)
     for light, expected in zip(dome["lights"], true, strict=True):
         frame = _read(
             capture,
@@ -179,7 +179,7 @@ def test_simulate_take__exposures_and_vignetting_follow_the_format(tmp_path, cap
     # 40 ms against 5 ms; rounding of 500
     np.testing.assert_allclose(long[used] / short[used], 8, rtol=2e-3)
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    r2 = (x - camera.matrix[0, 2]) ** 2 + (y - camera.matrix[1, 2]) ** 2
+    r2 = (x - camera.K[0, 2]) ** 2 + (y - camera.K[1, 2]) ** 2
     r2 /= (camera.width**2 + camera.height**2) / 4
     expected = (
         long * (1 + camera.vignette[0] * r2 + camera.vignette[1] * r2**2)[..., None]
