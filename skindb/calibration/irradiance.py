@@ -50,7 +50,7 @@ def light_falloff(light: LightRecord, points: Float64) -> tuple[Float64, Float64
     if light.falloff == 0:
         return square, np.ones(len(points))
     cosine = np.maximum(way @ light.axis, 0.0) / np.sqrt(square)
-    return square, np.asarray(cosine**light.falloff)
+    return square, cosine**light.falloff
 
 
 def light_intensities(

@@ -209,7 +209,7 @@ def reflected_ray(
     )
     point = camera.centre + (along - np.sqrt(under)) * view
     normal = (point - centre) / radius
-    return point, np.asarray(view - 2 * (view @ normal) * normal)
+    return point, view - 2 * (view @ normal) * normal
 
 
 def ball_centre(

@@ -229,7 +229,7 @@ def _solve(weights: sp.csr_matrix, rim: Index, rim_uv: Array) -> Float64 | None:
             )
         except RuntimeError:  # singular
             return None
-        uv[inner] = solver.solve(np.asarray(weights[inner][:, rim] @ rim_uv))
+        uv[inner] = solver.solve(weights[inner][:, rim] @ rim_uv)
     return uv if np.isfinite(uv).all() else None
 
 
@@ -560,4 +560,4 @@ def _cell(place: Array, size: int) -> tuple[Index, Float64]:
     """Pixel before a position along one axis, and the weight of the pixel after it."""
     centred = np.clip(place - 0.5, 0.0, size - 1.0)
     index = np.minimum(centred.astype(np.int64), size - 1)
-    return index, np.asarray(centred - index)
+    return index, centred - index

@@ -82,7 +82,7 @@ def project(
     plane[square >= _fold(coefficients)] = np.nan
     bent = _distort(plane, coefficients)
     matrix = float64(K)
-    return np.asarray(bent @ matrix[:2, :2].T + matrix[:2, 2]), depth
+    return bent @ matrix[:2, :2].T + matrix[:2, 2], depth
 
 
 def undistort(pixels: ArrayLike, K: ArrayLike, distortion: ArrayLike) -> Float64:
@@ -93,7 +93,7 @@ def undistort(pixels: ArrayLike, K: ArrayLike, distortion: ArrayLike) -> Float64
     matrix = float64(K)
     coefficients = float64(distortion)
     offset = float64(pixels) - matrix[:2, 2]
-    bent = np.asarray(offset @ np.linalg.inv(matrix[:2, :2]).T).reshape(-1, 2)
+    bent = (offset @ np.linalg.inv(matrix[:2, :2]).T).reshape(-1, 2)
     if not coefficients.any():
         return float64(bent.reshape(offset.shape))
     plane = np.empty_like(bent)

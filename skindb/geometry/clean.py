@@ -231,7 +231,7 @@ def _orient(points: Float64, faces: Index, report: _Report) -> Index:
     # an edge in the same direction
     key = turned * (len(points) + 1) + np.roll(turned, -1, axis=1)
     _, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
-    drop = np.asarray((count[inverse].reshape(-1, 3) > 1).any(axis=1))
+    drop = (count[inverse].reshape(-1, 3) > 1).any(axis=1)
     report.add("one_sided_faces", points, faces[drop])
     return turned[~drop]
 
@@ -239,7 +239,7 @@ def _orient(points: Float64, faces: Index, report: _Report) -> Index:
 def _largest_component(points: Float64, faces: Index, report: _Report) -> Index:
     label = face_components(faces) if len(faces) else np.zeros(0, np.int64)
     area = lengths(face_crosses(points, faces))
-    keep = np.asarray(label == np.bincount(label, area, minlength=1).argmax(), bool)
+    keep = label == np.bincount(label, area, minlength=1).argmax()
     touching = np.isin(faces, faces[keep]).any(axis=1)
     hanging = ~keep & np.isin(label, label[touching])
     island = ~keep & ~hanging

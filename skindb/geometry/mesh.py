@@ -435,7 +435,7 @@ def subdivide(
     for _ in range(levels):
         level, current = loop_matrix(current, matrix.shape[0])
         matrix = level @ matrix
-    return np.asarray(matrix @ float64(vertices)), current, matrix
+    return matrix @ float64(vertices), current, matrix
 
 
 def carry_points(

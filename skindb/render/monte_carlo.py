@@ -414,7 +414,7 @@ class _Hits:
         lit = np.ones((len(rows), 1), np.float32)
         light = Lamp(lamp[:, None], lit, float64(axis), float(falloff))
         shaded = self.surface.model.shade(points, light, eta=self.surface.eta)
-        return np.asarray(shaded * float64(weight)[:, None])
+        return shaded * float64(weight)[:, None]
 
 
 @dataclass(frozen=True)
@@ -495,7 +495,7 @@ def stratified(view: View, rng: np.random.Generator) -> Array:
     columns = across * side + _shuffled(shape, rng)[row, across, down]
     rows = down * side + _shuffled(shape, rng)[row, down, across]
     place = np.stack([columns, rows], axis=1)
-    return np.asarray((place + rng.random(place.shape)) / side**2)
+    return (place + rng.random(place.shape)) / side**2
 
 
 def _shuffled(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.intp]:
@@ -511,4 +511,4 @@ def points_on_discs(lights: Lights, chosen: Index, rng: np.random.Generator) -> 
     across = (
         np.cos(turn)[:, None] * tangent[chosen] + np.sin(turn)[:, None] * second[chosen]
     )
-    return np.asarray(lights.position[chosen] + radius[:, None] * across)
+    return lights.position[chosen] + radius[:, None] * across

@@ -361,14 +361,14 @@ class Environment:
 
     def along(self, direction: Array) -> Array:
         """Radiance (n, 3) from unit directions (n, 3)."""
-        return np.asarray(self.radiance.reshape(-1, 3)[self._texel(direction)])
+        return self.radiance.reshape(-1, 3)[self._texel(direction)]
 
     def pdf(self, direction: Array) -> Array:
         """Probability density (n,) per steradian with which `sample` draws unit
         directions (n, 3).
         """
         texel = self._texel(direction)
-        return np.asarray(self._probability[texel] / self._solid_angle[texel])
+        return self._probability[texel] / self._solid_angle[texel]
 
     def sample(self, draw: Array) -> Array:
         """Unit directions (n, 3) drawn in proportion to luminance, from uniform numbers

@@ -468,4 +468,4 @@ def escape_factor(view: View, eta: float) -> Array:
     boundary (eq. 9).
     """
     cosine = dots(view.normal, view.towards)
-    return np.asarray(fresnel_transmittance(cosine, eta) / np.pi)[:, None]
+    return (fresnel_transmittance(cosine, eta) / np.pi)[:, None]

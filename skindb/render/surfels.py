@@ -345,4 +345,4 @@ def _unit(name: str, direction: ArrayLike) -> Array:
             f"a length of {worst:.4g}",
             "normalise them",
         )
-    return np.asarray(vectors / length)
+    return vectors / length

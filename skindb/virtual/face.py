@@ -116,7 +116,7 @@ def _cone(
 def _join(a: Float64, b: Float64, blend: float) -> Float64:
     """Smooth union: cubic polynomial minimum, twice differentiable."""
     h = np.maximum(blend - np.abs(a - b), 0) / blend
-    return np.asarray(np.minimum(a, b) - h**3 * blend / 6)
+    return np.minimum(a, b) - h**3 * blend / 6
 
 
 def _carve(a: Float64, b: Float64, blend: float) -> Float64:
@@ -198,7 +198,7 @@ def _eyes(p: Float64, d: Float64, s: FaceShape) -> Float64:
 
 def lid_height(x: Float64, s: FaceShape) -> Float64:
     """Height of the closed lids' line at |x|."""
-    return np.asarray(29.0 + 0.012 * (x - s.eye_distance) ** 2)
+    return 29.0 + 0.012 * (x - s.eye_distance) ** 2
 
 
 def _nose(p: Float64, d: Float64, s: FaceShape) -> Float64:
@@ -250,7 +250,7 @@ def _mouth(p: Float64, d: Float64, s: FaceShape) -> Float64:
 
 def mouth_line(x: Float64) -> Float64:
     """Height of the line between the lips at |x|, above `mouth_height`."""
-    return np.asarray(
+    return (
         -0.6 * np.exp(-0.5 * (x / 4) ** 2)
         + 0.8 * np.exp(-0.5 * ((np.abs(x) - 8) / 5) ** 2)
         - 0.003 * x**2
@@ -322,7 +322,7 @@ def _front(flat: Float64, shape: FaceShape) -> Float64:
 def _soft(value: Float64, width: float) -> Float64:
     """Smooth step: 0 below -width, 0.5 at 0, 1 above width."""
     t = np.clip(0.5 + 0.5 * value / width, 0, 1)
-    return np.asarray(t * t * (3 - 2 * t))
+    return t * t * (3 - 2 * t)
 
 
 def region_membership(points: Float64, shape: FaceShape) -> dict[str, Float64]:
@@ -397,7 +397,7 @@ def _lips(x: Float64, y: Float64, z: Float64, s: FaceShape) -> Float64:
 
 
 def _brow_height(x: Float64, s: FaceShape) -> Float64:
-    return np.asarray(58.0 + 2.0 * s.brow - 0.012 * (x - 34) ** 2)
+    return 58.0 + 2.0 * s.brow - 0.012 * (x - 34) ** 2
 
 
 def _lashes(points: Float64, shape: FaceShape) -> Float64:
@@ -405,7 +405,7 @@ def _lashes(points: Float64, shape: FaceShape) -> Float64:
     x = np.abs(points[:, 0]) / shape.width
     y = points[:, 1] / shape.height
     across = np.exp(-0.5 * ((y - lid_height(x, shape) + 0.6) / 1.3) ** 2)
-    return np.asarray(
+    return (
         across
         * _soft(14.5 - np.abs(x - shape.eye_distance), 2)
         * _soft(points[:, 2] - 60, 8)

@@ -38,7 +38,7 @@ class Head:
 
     def region(self, name: str) -> Mask:
         """Mask (n,) of the vertices with a membership above one half."""
-        return np.asarray(self.membership[name] > 0.5)
+        return self.membership[name] > 0.5
 
 
 def parametric_head(

@@ -126,7 +126,7 @@ def _smooth(distance: Float64, value: Float64, error: Float64) -> Float64:
         * (distance[1:-1] / (SMOOTH * PITCH))[:, None]
     )
     line = np.linalg.solve(np.diag(weight) + bend.T @ bend, weight * target)
-    return np.asarray(np.exp(line) / distance**2)
+    return np.exp(line) / distance**2
 
 
 def write_probe(

@@ -228,7 +228,7 @@ def _pigment(head: Head, person: Person) -> tuple[Float64, Float64]:
     ):
         spot = d * np.exp(-0.5 * ((p[near] - c) ** 2).sum(axis=1) / s**2)
         dark[near] = np.maximum(dark[near], spot)
-    return np.asarray(melanin + dark), blood
+    return melanin + dark, blood
 
 
 def _hair(head: Head, person: Person) -> Float64:
@@ -331,4 +331,4 @@ def _sigma_tr(points: Float64, sites: tuple[Site, ...]) -> Float64:
         [1 / (((points - p) ** 2).sum(axis=1) + 25.0) for p, _ in anchors], axis=1
     )
     weight /= weight.sum(axis=1, keepdims=True)
-    return np.asarray(1 / (weight @ np.stack([1 / tr for _, tr in anchors])))
+    return 1 / (weight @ np.stack([1 / tr for _, tr in anchors]))
