@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from skindb.types import Array, Faces, Float64, Index, Mask, dots, float64, lengths
@@ -112,21 +112,18 @@ def winding_flips(faces: Faces) -> Mask:
     """Mask (f,) of faces to turn over for a consistent winding; in each component the
     minority is turned.
     """
-    face, neighbour, alike = _pairs(faces)
     n = len(faces)
-    parity = sp.csr_matrix((np.where(alike, 1, 2), (face, neighbour)), shape=(n, n))
-    parity = parity.maximum(parity.T).tocsr()
-    flip = np.zeros(n, bool)
-    for members in _groups(face_components(faces)):
-        if len(members) == 1:
-            continue
-        order, parent = breadth_first_order(parity, int(members[0]), directed=False)
-        step = np.asarray(parity[order[1:], parent[order[1:]]]).ravel() == 2
-        for node, turned in zip(order[1:].tolist(), step.tolist(), strict=True):
-            flip[node] = flip[parent[node]] ^ turned
-        if 2 * flip[members].sum() > len(members):
-            flip[members] ^= True
-    return flip
+    face, neighbour, alike = _pairs(faces)
+    # every face twice, as it is and turned over, each joined to the sides that it fits
+    fitting = np.where(alike, neighbour, neighbour + n)
+    turned = (fitting + n) % (2 * n)
+    rows = np.concatenate([face, face + n])
+    sides = pair_components(rows, np.concatenate([fitting, turned]), 2 * n)
+    component = np.minimum(sides[:n], sides[n:])
+    flip = sides[:n] != component
+    total = np.bincount(component)
+    fewer = 2 * np.bincount(component, flip) <= total
+    return np.asarray(flip == fewer[component])
 
 
 def fans(faces: Faces) -> Index:
@@ -161,12 +158,6 @@ def _pairs(faces: Faces) -> tuple[Index, Index, Mask]:
     side, opposite_side = _shared_sides(faces)
     start = np.asarray(faces, np.int64).ravel()
     return side // 3, opposite_side // 3, start[side] != start[opposite_side]
-
-
-def _groups(labels: Index) -> list[Index]:
-    order = np.argsort(labels, kind="stable")
-    cuts = np.flatnonzero(np.diff(labels[order])) + 1
-    return np.split(order, cuts)
 
 
 def morton_order(points: Array) -> Index:
