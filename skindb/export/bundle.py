@@ -16,7 +16,7 @@ from skindb import __version__
 from skindb.errors import input_error
 from skindb.export.gltf import export_gltf
 from skindb.export.inputs import describe_edit
-from skindb.export.maps import TextureMap, texture_maps
+from skindb.export.maps import RGB, TextureMap, texture_maps
 from skindb.export.scenes import (
     MATERIAL,
     MESH,
@@ -25,7 +25,7 @@ from skindb.export.scenes import (
     export_mitsuba,
     export_usd,
 )
-from skindb.export.textures import Skin, skin_of
+from skindb.export.textures import skin_of
 from skindb.files import filled_template, make_private, plain, private_file
 from skindb.reflectance.brdf_files import write_merl, write_tables
 from skindb.reflectance.dictionary import Dictionary
@@ -63,6 +63,38 @@ SITE_FIGURES = {
     "standard_error": variables.SITE_SIGMA_TR_ERROR,
     "total_error": variables.SITE_SIGMA_TR_TOTAL_ERROR,
 }
+# what the files beside maps and bases hold, and their units
+SCENES = {
+    "model.glb": (
+        "glTF 2.0: mesh, uv, shading normals as a texture, and a metallic-roughness "
+        "approximation of the material",
+        "m",
+    ),
+    f"usd/{STAGE}": (
+        "USD scene: mesh, and an OpenPBR material (MaterialX) with light under the skin",
+        "mm",
+    ),
+    f"usd/{MATERIAL}": (
+        "only the OpenPBR material, for programs that read MaterialX; lengths in mm",
+        "mm",
+    ),
+    "usd/baseColor.png": ("base colour, sRGB", "1"),
+    "usd/roughness.png": ("perceptual roughness, linear", "1"),
+    "usd/specularFactor.png": ("factor on all reflection, linear", "1"),
+    "usd/normal.png": (
+        "normals in tangent space, times 0.5 plus 0.5, +y towards the top of the texture",
+        "1",
+    ),
+    f"mitsuba/{MESH}": (
+        "mesh for Mitsuba: positions [mm], shading normals, uv",
+        "mm",
+    ),
+    f"mitsuba/{PROGRAM}": (
+        "Mitsuba 3: the exact BRDFs as a BSDF, and a scene, which python skin.py "
+        "picture.exr renders",
+        "mm",
+    ),
+}
 CONVENTIONS = {
     "length": "mm in maps and tables, metres in model.glb",
     "frame": "right-handed, +x to the subject's left, +y up, +z out of the face",
@@ -95,8 +127,7 @@ CONVENTIONS = {
 }
 
 
-def _size(count: int) -> str:
-    return f"{count / 1e6:.1f} MB" if count >= 100_000 else f"{count / 1e3:.1f} kB"
+Files = dict[str, dict[str, Any]]  # path -> what it holds, units, and more
 
 
 def export_bundle(
@@ -139,7 +170,6 @@ def export_bundle(
             content,
             "choose another folder",
         )
-    report = progress or silent
     staged = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.partial")
     try:
         make_private(staged)
@@ -152,13 +182,13 @@ def export_bundle(
             "choose another folder",
         ) from None
     try:
-        described = _write_parts(model, staged, size, merl, report)
+        described = _write_parts(model, staged, size, merl, progress or silent)
         manifest = _manifest(model, staged, described)
         text = json.dumps(plain(manifest), indent=1, allow_nan=False)
         private_file(staged / "manifest.json").write_text(text + "\n", encoding="utf-8")
         has_merl = any(name.endswith(".binary") for name in described)
         template = ("skindb.export", "README.txt.jinja")
-        text = filled_template(*template, **manifest, has_merl=has_merl, size=_size)
+        text = filled_template(*template, **manifest, has_merl=has_merl)
         private_file(staged / "README.txt").write_text(text, encoding="utf-8")
         if target.exists():
             target.rmdir()
@@ -181,143 +211,89 @@ def merl_table(table: Float32) -> Float64:
 
 def _write_parts(
     model: xr.DataTree, folder: Path, size: int | None, merl: bool, report: Progress
-) -> dict[str, dict[str, Any]]:
+) -> Files:
     """Write all files except the manifest; returns a description of each by its path."""
     report("maps", 0, 3)
     maps = texture_maps(model, size=size)
-    described = _write_maps(maps, folder / "maps")
+    files = _write_maps(maps, folder / "maps")
     path = maps.get("mean_free_path")
-    longest = (
-        float(path.values.max())
-        if path is not None and len(path.channels) == 3
-        else 0.0
-    )
+    longest = 0.0
+    if path is not None and len(path.channels) == 3:
+        longest = float(path.values.max())
     del path, maps  # large, and the textures need as much memory again
     report("bases", 1, 3)
-    described |= _write_bases(model["basis"].to_dataset(), folder / "bases", merl)
+    files |= _write_bases(model["basis"].to_dataset(), folder / "bases", merl)
     report("glTF", 2, 3)
     skin = skin_of(model, size=size)
-    error = export_gltf(model, folder / "model.glb", skin=skin)
-    text = (
-        "glTF 2.0: mesh, uv, shading normals as a texture, and a metallic-roughness "
-        "approximation of the material"
-    )
-    described["model.glb"] = {
-        "holds": text,
-        "units": "m",
-        "approximation_error": error,
-    }
+    export_gltf(model, folder / "model.glb", skin=skin)
     export_usd(model, folder / "usd", skin, longest_path=longest)
-    described |= _usd_files(skin)
     export_mitsuba(model, folder / "mitsuba")
-    text = "mesh for Mitsuba: positions [mm], shading normals, uv"
-    described[f"mitsuba/{MESH}"] = {"holds": text, "units": "mm"}
-    text = (
-        "Mitsuba 3: the exact BRDFs as a BSDF, and a scene, which python skin.py "
-        "picture.exr renders"
-    )
-    described[f"mitsuba/{PROGRAM}"] = {"holds": text, "units": "mm"}
-    report("done", 3, 3)
-    return described
-
-
-def _usd_files(skin: Skin) -> dict[str, dict[str, Any]]:
-    """Descriptions of the files of the USD scene."""
-    holds = {
-        STAGE: (
-            "USD scene: mesh, and an OpenPBR material (MaterialX) with light under the skin",
-            "mm",
-        ),
-        MATERIAL: (
-            "only the OpenPBR material, for programs that read MaterialX; lengths in mm",
-            "mm",
-        ),
-        "baseColor.png": ("base colour, sRGB", "1"),
-        "roughness.png": ("perceptual roughness, linear", "1"),
-        "specularFactor.png": ("factor on all reflection, linear", "1"),
-        "normal.png": (
-            "normals in tangent space, times 0.5 plus 0.5, +y towards the top of the texture",
-            "1",
-        ),
-    }
-    files: dict[str, dict[str, Any]] = {
-        f"usd/{name}": {"holds": text, "units": units}
-        for name, (text, units) in holds.items()
-    }
+    files |= {name: _held(*described) for name, described in SCENES.items()}
+    files["model.glb"]["approximation_error"] = skin.error
     files[f"usd/{STAGE}"] |= {
         "approximation_error": skin.error_of_one_index,
         "approximation_error_of_preview": skin.error_of_preview,
     }
+    report("done", 3, 3)
     return files
 
 
-def _write_maps(maps: dict[str, TextureMap], folder: Path) -> dict[str, dict[str, Any]]:
+def _held(holds: str, units: str, **more: Any) -> dict[str, Any]:
+    """Description of a file."""
+    return {"holds": holds, "units": units, **more}
+
+
+def _write_maps(maps: dict[str, TextureMap], folder: Path) -> Files:
     make_private(folder)
-    described = {}
+    files = {}
     for name, texture in maps.items():
-        planes = dict(
-            zip(texture.channels, np.moveaxis(texture.values, -1, 0), strict=True)
-        )
+        values = texture.values
+        planes = dict(zip(texture.channels, np.moveaxis(values, -1, 0), strict=True))
         attributes = {"units": texture.units, "comments": texture.doc}
         attributes |= {key: CONVENTIONS[key] for key in ("frame", "colour", "texture")}
         write_exr(folder / f"{name}.exr", planes, attributes=attributes)
-        shape = {"width": texture.values.shape[1], "height": texture.values.shape[0]}
-        holds = {
-            "holds": texture.doc,
-            "units": texture.units,
-            "channels": list(texture.channels),
-        }
-        described[f"maps/{name}.exr"] = holds | shape
-    return described
+        files[f"maps/{name}.exr"] = _held(
+            texture.doc,
+            texture.units,
+            channels=list(texture.channels),
+            width=values.shape[1],
+            height=values.shape[0],
+        )
+    return files
 
 
-def _write_bases(
-    basis: xr.Dataset, folder: Path, merl: bool
-) -> dict[str, dict[str, Any]]:
+def _write_bases(basis: xr.Dataset, folder: Path, merl: bool) -> Files:
     make_private(folder)
     tables = kernel_tables(basis)
     count = tables.shape[-1]
-    names = (
-        basis["component"].values
-        if "component" in basis.coords
-        else [f"component{k}" for k in range(count)]
-    )
+    names = [f"component{k}" for k in range(count)]
+    if "component" in basis.coords:
+        names = [*map(str, basis["component"].values)]
     disc = float(basis[variables.DISC_ANGULAR_RADIUS])
-    dictionary = Dictionary(
-        tuple(map(str, names)), tables, TableGrid(*tables.shape[:3]), "basis", disc
-    )
-    arrays = (
-        {variables.BASIS_MIXTURE: basis[variables.BASIS_MIXTURE].values}
-        if variables.BASIS_MIXTURE in basis
-        else {}
-    )
+    grid = TableGrid(*tables.shape[:3])
+    dictionary = Dictionary(tuple(names), tables, grid, "basis", disc)
+    arrays = {}
+    if variables.BASIS_MIXTURE in basis:
+        arrays[variables.BASIS_MIXTURE] = basis[variables.BASIS_MIXTURE].values
     if "dictionary" in basis.coords:
-        arrays["dictionary_names"] = np.array(
-            list(map(str, basis["dictionary"].values))
-        )
+        arrays["dictionary_names"] = np.array([*map(str, basis["dictionary"].values)])
     write_tables(folder / "bases.npz", dictionary, **arrays)
     mixed = "mixtures of the measured BRDFs; " if arrays else ""
     text = (
         "basis_brdf (component, theta_h, theta_d, phi_d), its nodes [rad], "
         f"{mixed}skindb fit --dictionary reads it"
     )
-    described = {"bases/bases.npz": {"holds": text, "units": "sr-1"}}
+    files = {"bases/bases.npz": _held(text, "sr-1")}
     for k in range(count if merl else 0):
         write_merl(folder / f"component_{k}.binary", merl_table(tables[..., k]))
-        described[f"bases/component_{k}.binary"] = {
-            "holds": f"component {k}, MERL BRDF format",
-            "units": "sr-1",
-        }
-    return described
+        text = f"component {k}, MERL BRDF format"
+        files[f"bases/component_{k}.binary"] = _held(text, "sr-1")
+    return files
 
 
-def _manifest(
-    model: xr.DataTree, folder: Path, described: dict[str, dict[str, Any]]
-) -> dict[str, Any]:
+def _manifest(model: xr.DataTree, folder: Path, files: Files) -> dict[str, Any]:
     attrs = model.attrs
-    files = {
-        name: file | _fingerprint(folder / name) for name, file in described.items()
-    }
+    fitted = model["fitted"].to_dataset()
     return {
         "format": "skindb-bundle",
         "version": 1,
@@ -326,35 +302,32 @@ def _manifest(
         "may_be_published": "publish" in attrs["consent_scope"],
         "edited": describe_edit(attrs),
         "conventions": CONVENTIONS,
-        "refractive_index": float(model["fitted/refractive_index"]),
+        "refractive_index": float(fitted[variables.REFRACTIVE_INDEX]),
         "disc_angular_radius": float(model["basis/disc_angular_radius"]),
-        variables.EVEN_REFLECTION: float(
-            model["fitted"].to_dataset().get(variables.EVEN_REFLECTION, 0.0)
-        ),
+        variables.EVEN_REFLECTION: float(fitted.get(variables.EVEN_REFLECTION, 0.0)),
         "provenance": {name: attrs[name] for name in PROVENANCE if name in attrs},
-        "error": _errors(model["fitted"].to_dataset()),
-        "missing": _missing(model, described),
+        "error": _errors(fitted),
+        "missing": _missing(model, files),
         "translucency_sites": _sites(model),
-        "files": files,
+        "files": {
+            name: file | _fingerprint(folder / name) for name, file in files.items()
+        },
     }
 
 
-def _missing(model: xr.DataTree, described: dict[str, dict[str, Any]]) -> list[str]:
+def _missing(model: xr.DataTree, files: Files) -> list[str]:
     """Parts of a complete bundle that this one lacks, with the reasons."""
-    edited = (
-        "error, maps of errors, errors of translucency_sites: they describe the fit, "
-        "which did not see the edited face"
-    )
-    channels = described.get("maps/translucency.exr", {}).get("channels", [])
-    lost = [channel for channel in "RGB" if channel not in channels]
-    unprobed = (
-        [
-            f"maps/translucency.exr: {', '.join(lost)}: sigma_tr is unknown at all probe sites"
-        ]
-        if lost
-        else []
-    )
-    return [edited, *unprobed] if "edit" in model.attrs else unprobed
+    missing = []
+    if "edit" in model.attrs:
+        missing.append(
+            "error, maps of errors, errors of translucency_sites: they describe the fit, "
+            "which did not see the edited face"
+        )
+    channels = files.get("maps/translucency.exr", {}).get("channels", [])
+    if lost := ", ".join(channel for channel in RGB if channel not in channels):
+        text = "sigma_tr is unknown at all probe sites"
+        missing.append(f"maps/translucency.exr: {lost}: {text}")
+    return missing
 
 
 def _errors(fitted: xr.Dataset) -> dict[str, Any]:
@@ -362,27 +335,22 @@ def _errors(fitted: xr.Dataset) -> dict[str, Any]:
     fraction of each status.
     """
     status = fitted[variables.FIT_STATUS].values
-    report: dict[str, Any] = {"surfels": int(status.size)}
-    report["status_fraction"] = {
-        member.name.lower(): {
-            "fraction": float((status == member).mean()),
-            "meaning": member.explanation,
-        }
-        for member in FitStatus
-        if (status == member).any()
-    }
+    fractions = {}
+    for member in FitStatus:
+        if fraction := float((status == member).mean()):
+            about = {"fraction": fraction, "meaning": member.explanation}
+            fractions[member.name.lower()] = about
+    report: dict[str, Any] = {"surfels": status.size, "status_fraction": fractions}
     for name in names_of(Use.EXPORTED):
         values = fitted[name].values if name in fitted else np.zeros(0)
         finite = values[np.isfinite(values)]
-        if not finite.size:
-            continue
-        median, high = np.quantile(finite, [0.5, 0.95])
-        report[name] = {
-            "median": float(median),
-            "quantile_95": float(high),
-            "units": VARIABLES[name].units,
-            "meaning": VARIABLES[name].doc,
-        }
+        if finite.size:
+            report[name] = {
+                "median": float(np.median(finite)),
+                "quantile_95": float(np.quantile(finite, 0.95)),
+                "units": VARIABLES[name].units,
+                "meaning": VARIABLES[name].doc,
+            }
     return report
 
 

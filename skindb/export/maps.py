@@ -30,22 +30,14 @@ from skindb.types import (
 )
 
 Image = Float32
+# values (n, c) at the surfels, which may be unknown in some channels, unit and description
+Layer = tuple[AnyArray, str, str]
 RGB = ("R", "G", "B")
 MEASURED = {  # map: variable of the model; edited models have none of these
     "albedo_error": variables.DIFFUSE_REFLECTANCE_TOTAL_ERROR,
     "normal_error": variables.NORMAL_TOTAL_ERROR,
     "surface_reflectance": variables.SURFACE_REFLECTANCE,
     "surface_reflectance_error": variables.SURFACE_REFLECTANCE_ERROR,
-}
-UNIT_VECTORS = {
-    "normal": "unit shading normal, with x, y, z of the subject frame in R, G, B",
-    "normal_tangent": "unit shading normal, with its parts along tangent, bitangent (towards "
-    "v = 0) and normal in R, G, B",
-}
-TRANSLUCENCY = {
-    "translucency": "translucency 1 / sigma_tr, the diffusion length",
-    "mean_free_path": "mean free path with which a random walk under the skin, as of OpenPBR, "
-    "spreads light as far as the dipole with this sigma_tr",
 }
 CONFIDENCE = (
     "1 between fitted surfels, less towards doubtful ones, 0 where values are filled "
@@ -152,39 +144,37 @@ def texture_maps(
     fitted = required(model)
     trust = surfel_confidence(fitted)
     atlas = Atlas.of(model, chosen_size(model, size))
-    images = atlas.spread_known(_columns(fitted, atlas.triangles), trust)
-    albedo = "diffuse reflectance R_d plus even_reflection of the surface"
-    maps = {"albedo": TextureMap(images["albedo"], RGB, "1", albedo)}
-    for name, doc in UNIT_VECTORS.items():
-        maps[name] = TextureMap(unit(images[name]), RGB, "1", doc)
-    for k in range(fitted[variables.BASIS_WEIGHT].shape[1]):
-        weight = images[f"weight_{k}"]
-        doc = f"weight of component {k}"
-        maps[f"weight_{k}"] = TextureMap(weight, ("Y",), "1", doc)
-    for name, doc in TRANSLUCENCY.items():
-        channels = tuple(channel for channel in RGB if name + channel in images)
+    layers = _layers(fitted, atlas.triangles)
+    columns = {
+        f"{name} {channel}": column[:, None]
+        for name, (values, _, _) in layers.items()
+        for channel, column in zip(_channels(values), values.T, strict=True)
+    }
+    images = atlas.spread_known(columns, trust)
+    maps = {}
+    for name, (values, units, doc) in layers.items():
+        channels = tuple(c for c in _channels(values) if f"{name} {c}" in images)
         if channels:
-            planes = [images[name + channel] for channel in channels]
-            maps[name] = TextureMap(np.concatenate(planes, -1), channels, "mm", doc)
-    for name, variable in MEASURED.items():
-        if name in images:
-            spec = VARIABLES[variable]
-            channels = RGB if images[name].shape[-1] == 3 else ("Y",)
-            maps[name] = TextureMap(images[name], channels, spec.units, spec.doc)
-    confidence = atlas.confidence(trust)
+            planes = np.concatenate([images[f"{name} {c}"] for c in channels], axis=-1)
+            if name in ("normal", "normal_tangent"):
+                planes = unit(planes)
+            maps[name] = TextureMap(planes, channels, units, doc)
     status = texel_codes(surfel_texels(fitted), atlas.triangles, *atlas.raster)
     for name, plane, doc in (
-        ("confidence", confidence, CONFIDENCE),
-        ("status", status, STATUS),
+        ("confidence", atlas.confidence(trust), CONFIDENCE),
+        ("status", status.astype(np.float32), STATUS),
     ):
-        single = plane.astype(np.float32)[..., None]
-        maps[name] = TextureMap(single, ("Y",), "1", doc)
+        maps[name] = TextureMap(plane[..., None], ("Y",), "1", doc)
     return maps
 
 
-def _columns(fitted: xr.Dataset, triangles: AnyArray) -> dict[str, AnyArray]:
-    """Values (n, c) at the surfels of each map, and of each channel of the translucency, which
-    may be unknown in some.
+def _channels(values: AnyArray) -> tuple[str, ...]:
+    """Names of the channels of values (n, c)."""
+    return RGB if values.shape[1] == 3 else ("Y",)
+
+
+def _layers(fitted: xr.Dataset, triangles: AnyArray) -> dict[str, Layer]:
+    """What each map shows.
 
     Errors are interpolated like values, which overestimates them if the errors of
     surfels are independent.
@@ -192,28 +182,51 @@ def _columns(fitted: xr.Dataset, triangles: AnyArray) -> dict[str, AnyArray]:
     shading = fitted[variables.SHADING_NORMAL].values
     mesh = fitted[variables.SURFEL_NORMAL].values.astype(float)
     uv = fitted[variables.SURFEL_UV].values
-    position = fitted[variables.SURFEL_POSITION].values
-    frames = tangent_frames(position, mesh, uv, triangles)
-    weights = fitted[variables.BASIS_WEIGHT].values
-    columns = {
-        "albedo": even_diffuse(fitted),
-        "normal": shading,
-        "normal_tangent": to_tangent_space(shading, mesh, frames).astype(np.float32),
-        **{f"weight_{k}": column[:, None] for k, column in enumerate(weights.T)},
+    frames = tangent_frames(
+        fitted[variables.SURFEL_POSITION].values, mesh, uv, triangles
+    )
+    layers: dict[str, Layer] = {
+        "albedo": (
+            even_diffuse(fitted),
+            "1",
+            "diffuse reflectance R_d plus even_reflection of the surface",
+        ),
+        "normal": (
+            shading,
+            "1",
+            "unit shading normal, with x, y, z of the subject frame in R, G, B",
+        ),
+        "normal_tangent": (
+            to_tangent_space(shading, mesh, frames).astype(np.float32),
+            "1",
+            "unit shading normal, with its parts along tangent, bitangent (towards "
+            "v = 0) and normal in R, G, B",
+        ),
     }
+    for k, weight in enumerate(fitted[variables.BASIS_WEIGHT].values.T):
+        layers[f"weight_{k}"] = (weight[:, None], "1", f"weight of component {k}")
     if variables.SIGMA_TR in fitted:
         sigma_tr = fitted[variables.SIGMA_TR].values
         sigma_tr = np.where(sigma_tr > 0, sigma_tr, np.nan)
         diffuse = fitted[variables.DIFFUSE_REFLECTANCE].values
         eta = float(fitted[variables.REFRACTIVE_INDEX])
-        path = mean_free_path(diffuse, sigma_tr, eta=eta).astype(np.float32)
-        for c, channel in enumerate(RGB):
-            columns[f"translucency{channel}"] = 1 / sigma_tr[:, [c]]
-            columns[f"mean_free_path{channel}"] = path[:, [c]]
+        layers["translucency"] = (
+            1 / sigma_tr,
+            "mm",
+            "translucency 1 / sigma_tr, the diffusion length",
+        )
+        layers["mean_free_path"] = (
+            mean_free_path(diffuse, sigma_tr, eta=eta).astype(np.float32),
+            "mm",
+            "mean free path with which a random walk under the skin, as of OpenPBR, "
+            "spreads light as far as the dipole with this sigma_tr",
+        )
     for name, variable in MEASURED.items():
         if variable in fitted:
-            columns[name] = fitted[variable].values.reshape(len(shading), -1)
-    return columns
+            spec = VARIABLES[variable]
+            values = fitted[variable].values.reshape(len(shading), -1)
+            layers[name] = (values, spec.units, spec.doc)
+    return layers
 
 
 def tangent_frames(

@@ -11,6 +11,7 @@ import xarray as xr
 from skindb import __version__
 from skindb.export.textures import Skin, unit_normals
 from skindb.files import filled_template, make_private, private_file
+from skindb.render.image import write_png
 from skindb.schema import variables
 from skindb.types import Array
 
@@ -45,8 +46,15 @@ def export_usd(
         Largest value of `../maps/mean_free_path.exr` [mm]. With 0, light leaves where it enters.
     """
     make_private(folder)
-    for name, data in skin.files().items():
-        private_file(folder / f"{name}.png").write_bytes(data)
+    planes = {
+        "baseColor": skin.pictures["baseColor"],
+        "roughness": skin.pictures["metallicRoughness"][..., 1],
+        "specularFactor": skin.pictures["specular"][..., 3],
+        "normal": skin.pictures["normal"],
+    }
+    for name, plane in planes.items():
+        grey_or_colour = plane if plane.ndim == 3 else np.stack([plane] * 3, axis=-1)
+        write_png(folder / f"{name}.png", grey_or_colour)
     radius = f"{longest_path:.6g}" if longest_path > 0 else ""
     material = {
         "version": __version__,

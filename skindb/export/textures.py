@@ -4,12 +4,10 @@ error of the approximation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
-import imagecodecs
 import numpy as np
 import xarray as xr
-from scipy import ndimage
 
 from skindb.export.inputs import chosen_size, required
 from skindb.export.maps import Atlas, tangent_frames, to_tangent_space
@@ -26,7 +24,6 @@ from skindb.types import (
     Bytes,
     Float32,
     Float64,
-    Index,
     float64,
     lengths,
     unit,
@@ -67,6 +64,33 @@ class _Pairs:
     cos_d: Array
     weight: Array  # solid angles of light and camera times cos_o, as in a picture
 
+    def parts(self, tables: Float32, eta: float) -> Array:
+        """Diffuse term for an albedo of 1, and the components (pairs, 1 + k) [sr^-1]."""
+        through = (
+            fresnel_transmittance(self.cos_i, eta)
+            * fresnel_transmittance(self.cos_o, eta)
+            / np.pi
+        )
+        return np.column_stack([through, lookup(tables, *self.angles)])
+
+    def lobe(self, roughness: float | Array) -> Array:
+        """GGX distribution with Smith's separable masking, divided by 4 cos_i cos_o (glTF
+        2.0, appendix B).
+        """
+        a2 = np.asarray(roughness) ** 4
+        spread = a2 / (np.pi * (self.cos_h**2 * (a2 - 1) + 1) ** 2)
+        masking = [
+            1 / (c + np.sqrt(a2 + (1 - a2) * c * c)) for c in (self.cos_i, self.cos_o)
+        ]
+        return np.asarray(spread * masking[0] * masking[1])
+
+
+def _amounts(diffuse: Array, weights: Array) -> Array:
+    """Factors (3, n, 1 + k) on the parts of the model in each channel."""
+    return np.stack(
+        [np.column_stack([colour, weights]) for colour in diffuse.T]
+    ).astype(float)
+
 
 def fit_material(
     tables: Float32, diffuse: Array, weights: Array, *, eta: float
@@ -91,15 +115,8 @@ def fit_material(
         Refractive index of the diffuse term of skin.
     """
     pairs = _pairs()
-    through = (
-        fresnel_transmittance(pairs.cos_i, eta)
-        * fresnel_transmittance(pairs.cos_o, eta)
-        / np.pi
-    )
-    parts = np.concatenate([through[:, None], lookup(tables, *pairs.angles)], axis=1)
-    amounts = np.stack(
-        [np.concatenate([diffuse[:, [c]], weights], axis=1) for c in range(3)]
-    ).astype(float)
+    parts = pairs.parts(tables, eta)
+    amounts = _amounts(diffuse, weights)
     base: Array = float64(diffuse)
     low: Array
     high: Array
@@ -127,10 +144,7 @@ def _fit_lobe(
     parameters = np.zeros((len(base), 3))
     best = np.full(len(base), -np.inf)
     for roughness in ROUGHNESS:
-        lobe = _ggx(
-            np.full((1, 1), roughness**4), pairs.cos_i, pairs.cos_o, pairs.cos_h
-        )[0]
-        gloss = lobe[:, None] * matt * np.pi
+        gloss = pairs.lobe(roughness)[:, None] * matt * np.pi
         squares = [
             a.T @ (use[:, None] * b)
             for a, b in ((gloss, gloss), (gloss, matt), (matt, matt))
@@ -224,11 +238,7 @@ def _fit_base(
     )
     gloss = np.zeros((len(low), 3))
     for value in np.unique(roughness):
-        lobe = (
-            _ggx(np.full((1, 1), value**4), pairs.cos_i, pairs.cos_o, pairs.cos_h)[0]
-            * use
-            / np.pi
-        )
+        lobe = pairs.lobe(value) * use / np.pi
         gloss[roughness == value] = [float((lobe * rise**i).sum()) for i in range(3)]
     shine = low * (constant * gloss[:, 0] + slope * gloss[:, 1]) + high * (
         constant * gloss[:, 1] + slope * gloss[:, 2]
@@ -267,18 +277,11 @@ def approximation_error(
         pixel sees.
     """
     pairs = _pairs()
-    through = (
-        fresnel_transmittance(pairs.cos_i, eta)
-        * fresnel_transmittance(pairs.cos_o, eta)
-        / np.pi
-    )
-    ours = (
-        diffuse[:, None, :] * through[:, None]
-        + (weights @ lookup(tables, *pairs.angles).T)[..., None]
-    )
-    theirs = gltf_brdf(values, pairs.cos_i, pairs.cos_o, pairs.cos_h, pairs.cos_d)
-    ours = ours * pairs.cos_i[:, None]
-    theirs = theirs * pairs.cos_i[:, None]
+    parts = pairs.parts(tables, eta)
+    model = np.moveaxis(_amounts(diffuse, weights) @ parts.T, 0, -1)
+    cosine = pairs.cos_i[:, None]
+    ours = model * cosine
+    theirs = gltf_brdf(values, pairs) * cosine
     return {
         "relative_rms": _relative(ours, theirs, pairs.weight),
         "relative_rms_perceptual": _relative(
@@ -287,28 +290,16 @@ def approximation_error(
     }
 
 
-def gltf_brdf(
-    values: Material, cos_i: Array, cos_o: Array, cos_h: Array, cos_d: Array
-) -> Array:
-    """BRDF (n, directions, 3) of the material, by the equations of glTF 2.0, appendix
-    B, and KHR_materials_specular.
-
-    Parameters
-    ----------
-    values
-        Material at n points.
-    cos_i, cos_o, cos_h, cos_d
-        Cosines (directions,) between the normal and light, camera and half vector, and
-        between light and half vector.
+def gltf_brdf(values: Material, pairs: _Pairs) -> Array:
+    """BRDF (n, pairs, 3) of the material, by the equations of glTF 2.0, appendix B, and
+    KHR_materials_specular.
     """
-    f0 = np.asarray(values.f0)[:, None]
-    fresnel = np.asarray(values.specular)[:, None] * (f0 + (1 - f0) * (1 - cos_d) ** 5)
-    a2 = (np.asarray(values.roughness)[:, None]) ** 4
-    gloss = fresnel * _ggx(a2, cos_i, cos_o, cos_h)
-    return np.asarray(
-        (1 - fresnel)[..., None] * values.base_color[:, None, :] / np.pi
-        + gloss[..., None]
-    )
+    f0 = values.f0[:, None]
+    rise = (1 - pairs.cos_d) ** 5
+    fresnel = values.specular[:, None] * (f0 + (1 - f0) * rise)
+    gloss = fresnel * pairs.lobe(values.roughness[:, None])
+    matt = (1 - fresnel)[..., None] * values.base_color[:, None, :] / np.pi
+    return np.asarray(matt + gloss[..., None])
 
 
 def _relative(ours: Array, theirs: Array, weight: Array) -> float:
@@ -338,24 +329,13 @@ def _pairs() -> _Pairs:
     return _Pairs((h, d, p), cos_i, cos_o, np.cos(h), np.cos(d), weight)
 
 
-def _ggx(a2: Array, cos_i: Array, cos_o: Array, cos_h: Array) -> Array:
-    """GGX distribution with Smith's separable masking, divided by 4 cos_i cos_o (glTF
-    2.0, appendix B).
-    """
-    spread = a2 / (np.pi * (cos_h**2 * (a2 - 1) + 1) ** 2)
-    masking = [1 / (c + np.sqrt(a2 + (1 - a2) * c * c)) for c in (cos_i, cos_o)]
-    return np.asarray(spread * masking[0] * masking[1])
-
-
 @dataclass(frozen=True)
 class Skin:
     """8-bit textures, the vertices of the mesh, and constants of the material.
 
-    `error` is the `approximation_error` of the glTF material, with
-    `normal_error_degrees`, the median angle between the shading normals and those of
-    the texture at the surfels. `error_of_one_index` is the error of a material with the
-    same index of refraction everywhere, as in OpenPBR, and `error_of_preview` that of
-    one that has no specular factor either, as UsdPreviewSurface.
+    `error` is the `approximation_error` of the glTF material, `error_of_one_index` that of
+    a material with the same index of refraction everywhere, as in OpenPBR, and
+    `error_of_preview` that of one that has no specular factor either, as UsdPreviewSurface.
     """
 
     # baseColor, metallicRoughness, specular, specularColor and normal
@@ -368,22 +348,6 @@ class Skin:
     error: dict[str, float]
     error_of_one_index: dict[str, float]
     error_of_preview: dict[str, float]
-
-    def files(self) -> dict[str, bytes]:
-        """PNG files with one quantity each: baseColor, roughness, specularFactor and normal."""
-        grey = {
-            "roughness": self.pictures["metallicRoughness"][..., 1],
-            "specularFactor": self.pictures["specular"][..., 3],
-        }
-        planes = {name: self.pictures[name] for name in ("baseColor", "normal")}
-        planes |= {
-            name: np.repeat(value[..., None], 3, axis=-1)
-            for name, value in grey.items()
-        }
-        return {
-            name: bytes(imagecodecs.png_encode(np.ascontiguousarray(value)))
-            for name, value in planes.items()
-        }
 
 
 def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
@@ -398,56 +362,49 @@ def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
     model = as_mixture(model)
     fitted = required(model)
     eta = float(fitted[variables.REFRACTIVE_INDEX])
-    mesh = model["mesh"].to_dataset()
     trust = surfel_confidence(fitted)
     tables = kernel_tables(model["basis"].to_dataset())
     trusted = np.flatnonzero(trust > 0)
     diffuse = even_diffuse(fitted)[trusted]
     weights = fitted[variables.BASIS_WEIGHT].values[trusted]
     skin = fit_material(tables, diffuse, weights, eta=eta)
-    mean_f0 = (
-        float(np.average(skin.f0, weights=skin.specular))
-        if skin.specular.any()
-        else float(skin.f0.mean())
-    )
+    ones = np.ones_like(skin.f0)
+    shares = skin.specular if skin.specular.any() else ones
+    mean_f0 = float(np.average(skin.f0, weights=shares))
     reflection = max(float((skin.specular * skin.f0).mean()), MIN_F0)
-    one_index = replace(skin, f0=np.full_like(skin.f0, mean_f0))
-    preview = replace(
-        skin, specular=np.ones_like(skin.f0), f0=np.full_like(skin.f0, reflection)
-    )
-    error, of_one_index, of_preview = _errors(
-        tables, diffuse, weights, (skin, one_index, preview), eta=eta
-    )
-    shape = _shape(fitted, mesh[variables.TRIANGLE].values)
+    some = np.linspace(0, len(ones) - 1, min(ERROR_POINTS, len(ones))).astype(int)
+    errors = [
+        approximation_error(
+            tables,
+            diffuse[some],
+            weights[some],
+            Material(
+                skin.base_color[some], specular[some], f0[some], skin.roughness[some]
+            ),
+            eta=eta,
+        )
+        for specular, f0 in (
+            (skin.specular, skin.f0),
+            (skin.specular, mean_f0 * ones),
+            (ones, reflection * ones),
+        )
+    ]
+    shape = _shape(fitted, model["mesh"].to_dataset()[variables.TRIANGLE].values)
     top = float(max(skin.f0.max(), MIN_F0))
-    columns = _columns(skin, trusted, shape, top)
-    atlas = Atlas.of(model, chosen_size(model, size))
-    pictures = _textures(atlas.spread_known(columns, trust))
-    error["normal_error_degrees"] = _normal_error(pictures["normal"], shape, trusted)
-    f0 = (top, max(mean_f0, MIN_F0), reflection)
-    return Skin(pictures, shape, *f0, error, of_one_index, of_preview)
-
-
-def _errors(
-    tables: Float32,
-    diffuse: AnyArray,
-    weights: AnyArray,
-    materials: tuple[Material, ...],
-    *,
-    eta: float,
-) -> list[dict[str, float]]:
-    """`approximation_error` of each material, at some of the points."""
-    chosen = np.linspace(0, len(diffuse) - 1, min(ERROR_POINTS, len(diffuse))).astype(
-        int
+    bent = to_tangent_space(shape.shading, shape.normal, shape.tangent)
+    columns = np.zeros((len(trust), 9), np.float32)
+    columns[trusted] = np.column_stack(
+        [
+            skin.base_color,
+            skin.roughness,
+            skin.specular,
+            np.minimum(skin.f0 / top, 1.0),
+            bent[trusted],
+        ]
     )
-    samples = [
-        Material(*(getattr(material, part.name)[chosen] for part in fields(material)))
-        for material in materials
-    ]
-    return [
-        approximation_error(tables, diffuse[chosen], weights[chosen], material, eta=eta)
-        for material in samples
-    ]
+    atlas = Atlas.of(model, chosen_size(model, size))
+    pictures = _textures(atlas.spread(columns, trust))
+    return Skin(pictures, shape, top, max(mean_f0, MIN_F0), reflection, *errors)
 
 
 @dataclass(frozen=True)
@@ -473,69 +430,25 @@ def _shape(fitted: xr.Dataset, triangles: AnyArray) -> Shape:
     return Shape(place.astype(np.float32), normal, shading, tangent, uv, triangles)
 
 
-def _columns(
-    skin: Material, surfels: Index, shape: Shape, top: float
-) -> dict[str, Float32]:
-    """Values (n, c) of the textures at every surfel; 0 where nothing was fitted."""
-
-    def spread(values: Array) -> Float32:
-        out = np.zeros((len(shape.position), values.shape[1]), np.float32)
-        out[surfels] = values
-        return out
-
-    bent = to_tangent_space(shape.shading, shape.normal, shape.tangent)
+def _textures(planes: Float32) -> dict[str, Bytes]:
+    """8-bit textures, by their name in the material, from base colour, roughness, specular
+    factor, f0 relative to its largest value, and normals in tangent space (size, size, 9).
+    """
+    base, roughness, specular, f0, bent = np.split(planes, [3, 4, 5, 6], axis=-1)
+    full = np.full(f0.shape, 255, np.uint8)
     return {
-        "base": spread(skin.base_color),
-        "roughness": spread(skin.roughness[:, None]),
-        "specular": spread(skin.specular[:, None]),
-        "f0": spread(np.minimum(skin.f0 / top, 1.0)[:, None]),
-        "bent": spread(bent[surfels]),
-    }
-
-
-def _textures(values: dict[str, Float32]) -> dict[str, Bytes]:
-    """8-bit textures, by their name in the material."""
-    full = np.full(values["roughness"].shape, 255, np.uint8)
-    bent = unit(values["bent"])
-    return {
-        "baseColor": _eight_bits(encode_srgb(values["base"])),
+        "baseColor": _eight_bits(encode_srgb(base)),
         "metallicRoughness": np.concatenate(
-            [full, _eight_bits(values["roughness"]), 0 * full], axis=-1
+            [full, _eight_bits(roughness), 0 * full], axis=-1
         ),
-        "specular": np.concatenate(
-            [full, full, full, _eight_bits(values["specular"])], axis=-1
-        ),
-        "specularColor": np.repeat(_eight_bits(encode_srgb(values["f0"])), 3, axis=-1),
-        "normal": _eight_bits(0.5 * bent + 0.5),
+        "specular": np.concatenate([full, full, full, _eight_bits(specular)], axis=-1),
+        "specularColor": np.repeat(_eight_bits(encode_srgb(f0)), 3, axis=-1),
+        "normal": _eight_bits(0.5 * unit(bent) + 0.5),
     }
 
 
 def _eight_bits(values: AnyArray) -> Bytes:
     return np.asarray(np.round(np.clip(values, 0, 1) * 255), np.uint8)
-
-
-def _normal_error(picture: Bytes, shape: Shape, surfels: Index) -> float:
-    """Median angle [degree] between the shading normals and those of the texture at the surfels."""
-    size = len(picture)
-    places = (shape.uv[surfels].astype(float) * size - 0.5)[:, ::-1].T
-    bent = np.stack(
-        [
-            ndimage.map_coordinates(
-                picture[..., c] / 127.5 - 1, places, order=1, mode="nearest"
-            )
-            for c in range(3)
-        ],
-        1,
-    )
-    normal = shape.normal[surfels]
-    tangent = shape.tangent[surfels]
-    bitangent = np.cross(normal, tangent[:, :3]) * tangent[:, 3:]
-    normals = (
-        bent[:, :1] * tangent[:, :3] + bent[:, 1:2] * bitangent + bent[:, 2:] * normal
-    )
-    normals = unit(normals)
-    cosine = np.clip((normals * shape.shading[surfels]).sum(axis=1), -1, 1)
-    return float(np.degrees(np.median(np.arccos(cosine))))
 
 
 def unit_normals(fitted: xr.Dataset, name: str) -> Float64:
