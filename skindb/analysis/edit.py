@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from xarray import DataArray, Dataset, DataTree
+from xarray import Dataset, DataTree
 
 from skindb.analysis.albedo import cumulative, decorrelate, histogram, quantiles
 from skindb.analysis.brdf import project
@@ -30,8 +30,6 @@ MAX_AMOUNT = 100.0
 PROBED = "probe"  # measurements of the unedited skin
 MIN_REPORTED = 1e-3  # fraction of a change above which an omission is reported
 TEXTURE_SHIFT = variables.TRAIT_TEXTURE_SHIFT  # only where takes are registered
-ONE_SUBJECT = "unknown: only one subject"
-NO_SUBJECT = "unknown: no subject was measured"
 
 
 def apply_traits(
@@ -91,15 +89,12 @@ def apply_traits(
         * `edit_report`, for each part: requested and applied (mean change of the
           coefficients or of the diffuse reflectance R G B, or factor on sigma_tr R G
           B), clipped (fraction of the area limited to physical values; for the surface,
-          the fraction of the requested vector that was omitted), distance (of the
-          edited mean from that of the population, in standard deviations over takes; a
-          text if it is unknown), from_nearest (its part of `edit_distance`). For the
-          albedo also how: "texture", with trace (RMS difference from the target
-          quantiles before each iteration and after the last, for every axis) and
-          distance_before, or "colours", with projected (mean change by making quantiles
-          monotone, in standard deviations of colour). For the
-          translucency also unknown (traits whose shift was not measured, so that it is
-          not applied).
+          the fraction of the requested vector that was omitted), from_nearest (its part
+          of `edit_distance`). For the albedo also how: "colours", or "texture" with
+          trace (RMS difference from the target quantiles before each iteration and
+          after the last, for every axis), distance and distance_before (see
+          `edit_texture`; None if unknown). For the translucency also unknown (traits
+          whose shift was not measured, so that it is not applied).
     """
     honour_consent(model.attrs, "statistics")
     needed = [v.name for v in GROUPS["traits"] if v.name != TEXTURE_SHIFT]
@@ -186,7 +181,8 @@ def _moved_surface(
     )
     moved = here * weaker + np.maximum(step, 0.0)
     gram = H @ metric @ H.T
-    report = _report(shift, step, basis[variables.TAKE_COEFFICIENT], target, mean, gram)
+    takes = basis[variables.TAKE_COEFFICIENT].values
+    report = _report(shift, step, takes, target, mean, gram)
     whole = max(float(_length(shift, gram)), 1e-300)
     report["clipped"] = float(_length(step - shift, gram)) / whole
     return _with_weights(fitted, moved), report
@@ -291,7 +287,7 @@ def _moved_texture(
         "how": "texture",
         "requested": (_mean(fitted, colour) * np.expm1(step)).tolist(),
         "trace": [list(row) for row in edit.trace],
-        "distance": ONE_SUBJECT if edit.distance is None else edit.distance,
+        "distance": edit.distance,
         "distance_before": edit.distance_before,
     }
     return moved, report
@@ -313,13 +309,10 @@ def _with_albedo(
 ) -> tuple[Dataset, Report]:
     """The fitted surface with new albedos (n, 3), and the report of the change."""
     moved = with_albedo(fitted, target)
-    colour, out = (
-        version[variables.DIFFUSE_REFLECTANCE].values.astype(float)
-        for version in (fitted, moved)
-    )
+    colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(float)
     before = _mean(fitted, colour)
-    now = _mean(fitted, out)
-    takes = albedo[variables.ALBEDO_MEAN].sel(region=FACE)
+    now = _mean(fitted, moved[variables.DIFFUSE_REFLECTANCE].values.astype(float))
+    takes = albedo[variables.ALBEDO_MEAN].sel(region=FACE).values
     axes = albedo[variables.COLOUR_AXIS].values
     # on the decorrelated axes, the unit is the standard deviation of skin in that direction
     report = _report(now - before, now - before, takes, now, before, axes.T @ axes)
@@ -338,41 +331,27 @@ def _moved_albedo(
     fitted: Dataset, amount: Array, traits: Dataset, albedo: Dataset
 ) -> tuple[Dataset, Report]:
     """Shift the quantiles of albedo by the shift of the whole face."""
-    shift = np.tensordot(amount, traits[variables.TRAIT_QUANTILE_SHIFT].values, 1)
+    vectors = traits[variables.TRAIT_QUANTILE_SHIFT].sel(region=FACE).values
+    shift = np.tensordot(amount, vectors, 1)
     colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(float)
     good = finite_rows(colour)
-    mean, axes, edges = (
-        albedo[n].values
-        for n in (
-            variables.COLOUR_MEAN,
-            variables.COLOUR_AXIS,
-            variables.HISTOGRAM_EDGE,
-        )
-    )
+    mean = albedo[variables.COLOUR_MEAN].values
+    axes = albedo[variables.COLOUR_AXIS].values
+    edges = albedo[variables.HISTOGRAM_EDGE].values
     area = fitted[variables.SURFEL_AREA].values[good].astype(float)
     values = decorrelate(colour[good], mean, axes)
     here = histogram(np.clip(values, edges[:, 0], edges[:, -1]), area, edges)
-    face = albedo["region"].values.tolist().index(FACE)
     source = quantiles(here, edges)
-    shifted = source + shift[face]
-    target = valid_quantiles(shifted)
-    matched = np.stack(
-        [
-            shift_quantiles(values[:, a], here[a], target[a] - source[a], edges[a])
-            for a in range(3)
-        ],
-        axis=1,
-    )
+    step = valid_quantiles(source + shift) - source
+    matched = [
+        shift_quantiles(values[:, a], here[a], step[a], edges[a]) for a in range(3)
+    ]
     back = np.linalg.inv(axes).T
     edited = colour.copy()
-    edited[good] = matched @ back + mean
+    edited[good] = np.stack(matched, axis=1) @ back + mean
     moved, report = _with_albedo(fitted, edited, albedo)
-    report |= {
-        "how": "colours",
-        "requested": (shift[face].mean(axis=1) @ back).tolist(),
-        "projected": float(np.abs(target - shifted).mean()),
-    }
-    return moved, report
+    requested = shift.mean(axis=1) @ back
+    return moved, report | {"how": "colours", "requested": requested.tolist()}
 
 
 def _moved_sigma_tr(
@@ -385,7 +364,7 @@ def _moved_sigma_tr(
     before = np.log(fitted[variables.SIGMA_TR].values.astype(float))
     after = np.clip(before + log, *np.log(SIGMA_TR_RANGE))
     mean, now = (_mean(fitted, logs) for logs in (before, after))
-    takes = traits[variables.TAKE_LOG_SIGMA_TR].dropna("take")
+    takes = traits[variables.TAKE_LOG_SIGMA_TR].dropna("take").values
     report = _report(np.exp(log), np.exp(now - mean), takes, now, mean, np.eye(3))
     report["clipped"] = _fraction(fitted, after != before + log, before)
     is_unknown = ~is_measured & (amount != 0)
@@ -428,40 +407,23 @@ def _log_shift(amount: Array, traits: Dataset) -> tuple[Array, Mask]:
 def _report(
     requested: Array,
     applied: Array,
-    takes: DataArray,
+    takes: Array,
     now: Array,
     before: Array,
     metric: Array,
 ) -> Report:
-    """Report of the change of a mean (d,) from `before` to `now`, with its distances
-    from the mean of the takes (t, d), and from the nearest take or the mean before.
-
-    The first is in standard deviations of the takes over all directions, or a text if
-    these are unknown. The second is relative to the median distance between two takes,
-    and infinite if that is 0.
+    """Report of the change of a mean (d,) from `before` to `now`, with its distance from
+    the nearest take (t, d), or from the mean before, relative to the median distance
+    between two takes; infinite if that is 0.
     """
-    values = takes.values
-    i, j = np.triu_indices(len(values), 1)
-    typical = (
-        float(np.median(_length(values[i] - values[j], metric))) if len(i) else 0.0
-    )
-    near = float(_length(now - np.vstack([values, before]), metric).min())
+    i, j = np.triu_indices(len(takes), 1)
+    typical = np.median(_length(takes[i] - takes[j], metric)) if len(i) else 0.0
+    near = _length(now - np.vstack([takes, before]), metric).min()
     beyond = float("inf") if near > 0 else 0.0
-    distance: float | str = NO_SUBJECT
-    subjects = {str(take).partition(".")[0] for take in takes["take"].values}
-    if len(subjects) == 1:
-        distance = ONE_SUBJECT
-    elif subjects:
-        mean = values.mean(axis=0)
-        square = (_length(values - mean, metric) ** 2).sum() / (len(values) - 1)
-        distance = "unknown: all takes are alike"
-        if square > 0:
-            distance = float(_length(now - mean, metric) / np.sqrt(square))
     return {
         "requested": requested.tolist(),
         "applied": applied.tolist(),
-        "distance": distance,
-        "from_nearest": near / typical if typical > 0 else beyond,
+        "from_nearest": float(near / typical) if typical > 0 else beyond,
     }
 
 
@@ -470,37 +432,29 @@ def describe_edit(report: Mapping[str, Report]) -> list[str]:
     its attribute `edit_report`.
     """
     lines = []
-    surface = report.get("brdf", {})
     albedo = report.get("albedo", {})
-    if surface.get("clipped", 0.0) > MIN_REPORTED:
-        rule = "would have made weights negative and was omitted"
-        lines.append(f"brdf: {surface['clipped']:.1%} of the requested change {rule}")
-    cuts = {
-        part: report.get(part, {}).get("clipped", 0.0)
-        for part in ("albedo", "translucency")
-    }
-    limited = "values were limited to the physical range on"
-    lines += [
-        f"{part}: {limited} {cut:.1%} of the area" for part, cut in cuts.items() if cut
-    ]
+    for part, change in report.items():
+        clipped = change.get("clipped", 0.0)
+        if part == "brdf" and clipped > MIN_REPORTED:
+            rule = "would have made weights negative and was omitted"
+            lines.append(f"brdf: {clipped:.1%} of the requested change {rule}")
+        elif part != "brdf" and clipped:
+            limited = "values were limited to the physical range on"
+            lines.append(f"{part}: {limited} {clipped:.1%} of the area")
     if albedo.get("how") == "colours":
         lines.append(
             "albedo: only colours were edited; textures need a registration of the "
             "take and of the study"
         )
-    if albedo.get("how") == "texture" and not isinstance(albedo["distance"], str):
-        before = albedo["distance_before"]
-        after = albedo["distance"]
+    if albedo.get("distance") is not None:
         lines.append(
-            f"albedo: {after:.2f} standard deviations from the mean of the takes, "
-            f"{before:.2f} before the edit"
+            f"albedo: {albedo['distance']:.2f} standard deviations from the mean of the "
+            f"takes, {albedo['distance_before']:.2f} before the edit"
         )
-    unknown = report.get("translucency", {}).get("unknown", [])
-    lines += [
+    return lines + [
         f"translucency: the change with {trait} is unknown and was omitted"
-        for trait in unknown
+        for trait in report.get("translucency", {}).get("unknown", [])
     ]
-    return lines
 
 
 def _length(vectors: Array, metric: Array) -> Array:

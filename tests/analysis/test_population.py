@@ -498,7 +498,7 @@ def test_edit__is_stored_with_its_report(tmp_path, monkeypatch):
     report = tree.attrs["edit_report"]
     assert set(report) == {"brdf", "albedo", "translucency"}
     assert all(
-        {"requested", "applied", "clipped", "distance"} <= set(part)
+        {"requested", "applied", "clipped", "from_nearest"} <= set(part)
         for part in report.values()
     )
     assert record.provenance["edit_report"] == report
