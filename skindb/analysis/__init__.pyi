@@ -22,7 +22,6 @@ from .chromophores import (
 )
 from .components import (
     face_components,
-    mean_face,
     principal_components,
 )
 from .correlations import (
@@ -109,7 +108,6 @@ __all__ = [
     "group_effects",
     "groups_by",
     "linear_model",
-    "mean_face",
     "plot_albedo",
     "plot_basis_size",
     "plot_brdf_space",

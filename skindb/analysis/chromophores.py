@@ -24,7 +24,6 @@ from sklearn.exceptions import ConvergenceWarning
 from xarray import Dataset
 
 from skindb import plots
-from skindb.analysis.components import mean_face
 from skindb.analysis.quantities import Quantities
 from skindb.analysis.regions import map_regions
 from skindb.analysis.study import (
@@ -43,13 +42,12 @@ from skindb.analysis.texture import (
     MAPPED,
     covered_fractions,
 )
-from skindb.errors import InputError, input_error, require
+from skindb.errors import input_error, require
 from skindb.numerics.statistics import SUMMARY, Moments
 from skindb.parameters import group_option, seed_option
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
 from skindb.schema.label import CHANNELS, FACE
-from skindb.schema.notes import note
 from skindb.types import Array, Mask, finite_rows, lengths
 
 if TYPE_CHECKING:
@@ -571,30 +569,24 @@ class Parameters:
 
 
 def compute(population: Population, parameters: Parameters) -> Results:
-    """The results of the study. The mean face is omitted, with a note, where no texel
-    has enough subjects.
-    """
+    """The results of the study."""
     cohort = population.cohort
     landmarks = population.landmarks
     rng = np.random.default_rng(parameters.seed)
     axes = chromophore_axes(cohort, landmarks=landmarks, rng=rng)
     statistics = chromophore_statistics(cohort, axes=axes, landmarks=landmarks)
-    results = {
+    table = chromophore_table(
+        cohort, statistics=statistics, group_by=parameters.group_by
+    )
+    return {
         "chromophores": axes.merge(statistics, combine_attrs="override"),
-        "chromophore_table": chromophore_table(
-            cohort, statistics=statistics, group_by=parameters.group_by
-        ),
+        "chromophore_table": table,
     }
-    try:
-        results["mean_face"] = mean_face(cohort)
-    except InputError as error:
-        population.notes.extend(note("", str(fault)) for fault in error.faults)
-    return results
 
 
 STUDY = Study(
     name="chromophores",
-    description="melanin and haemoglobin in maps of albedo, and the mean face",
+    description="melanin and haemoglobin in maps of albedo",
     layout="maps",
     absolute=True,
     parameters=Parameters,

@@ -83,17 +83,15 @@ def summary_tables(model: DataTree) -> Dataset:
     Dataset
         For every region (those of the capture, and "face" for all surfels): number and
         area of the trusted surfels, area-weighted means of diffuse and surface
-        reflectance with their errors, and covariance of the colours. For every site:
-        sigma_tr with its errors and status. Coefficients and mixtures of the reduced
-        basis, mean weights of the dictionary, and medians of the residuals and of the
-        errors at held-out samples.
+        reflectance with their errors. For every site: sigma_tr with its errors and
+        status. Mixtures of the reduced basis, mean weights of the dictionary, and the
+        refractive index.
     """
     fitted = model["fitted"].to_dataset().load()
     masks = {FACE: np.ones(fitted.sizes["surfel"], bool)} | own_masks(fitted)
     parts = [
         region_tables(fitted, masks),
         _basis_tables(model, fitted),
-        _median_errors(fitted),
     ]
     if "translucency" in model.children:
         sites = model["translucency"].to_dataset()
@@ -121,8 +119,8 @@ def region_tables(fitted: Dataset, masks: Mapping[str, Mask]) -> Dataset:
         `region_surfels`, `region_area`, `region_diffuse_reflectance` with `_error`
         (from independent errors of the surfels) and `_total_error` (including the part
         that all surfels have in common, which averaging does not reduce),
-        `region_diffuse_covariance`, `region_surface_reflectance` with its error. NaN
-        for a region without trusted surfels.
+        `region_surface_reflectance` with its error. NaN for a region without trusted
+        surfels.
     """
     trusted = trusted_surfels(fitted)
     area = fitted[variables.SURFEL_AREA].values.astype(float)
@@ -153,14 +151,13 @@ def region_tables(fitted: Dataset, masks: Mapping[str, Mask]) -> Dataset:
             (variables.REGION_DIFFUSE_REFLECTANCE, mean),
             (variables.REGION_DIFFUSE_REFLECTANCE_ERROR, error),
             (variables.REGION_DIFFUSE_REFLECTANCE_TOTAL_ERROR, np.hypot(error, common)),
-            (variables.REGION_DIFFUSE_COVARIANCE, _covariance(colour[inside], weight)),
             (variables.REGION_SURFACE_REFLECTANCE, gloss),
             (variables.REGION_SURFACE_REFLECTANCE_ERROR, gloss_error),
         ):
             tables.setdefault(name, []).append(value)
     return dataset(
         {name: np.stack(values) for name, values in tables.items()},
-        coords={"region": list(masks), "channel": CHANNELS, "channel_2": CHANNELS},
+        coords={"region": list(masks), "channel": CHANNELS},
     )
 
 
@@ -191,7 +188,7 @@ def no_surfels_error(model: DataTree) -> InputError:
 
 
 def _basis_tables(model: DataTree, fitted: Dataset) -> Dataset:
-    """Coefficients of the reduced basis, its mixtures, and the mean weights of the dictionary."""
+    """Mixtures of the reduced basis, mean weights of the dictionary, and constants."""
     basis = model["basis"].to_dataset()
     names = (
         variables.BASIS_MIXTURE,
@@ -200,35 +197,7 @@ def _basis_tables(model: DataTree, fitted: Dataset) -> Dataset:
     )
     tables = basis[[name for name in names if name in basis]].load()
     index = [name for name in (variables.REFRACTIVE_INDEX,) if name in fitted]
-    eta = fitted[index].reset_coords(drop=True)
-    if variables.BASIS_WEIGHT not in fitted:
-        return xr.merge([tables, eta])
-    weights = fitted[variables.BASIS_WEIGHT].values.astype(float)
-    good = finite_rows(weights) & (
-        fitted[variables.FIT_STATUS].values == FitStatus.FITTED
-    )
-    mean = np.full(weights.shape[1:], np.nan)
-    if good.any():
-        area = fitted[variables.SURFEL_AREA].values[good].astype(float)
-        mean = np.average(weights[good], axis=0, weights=area)
-    coords = {"component": fitted["component"]} if "component" in fitted.coords else {}
-    # a cohort needs the labels of the dictionary even if the model stores no mixtures
-    weights_table = dataset({variables.MEAN_BASIS_WEIGHT: mean}, coords=coords)
-    parts = [tables, weights_table, eta]
-    return xr.merge(parts, combine_attrs="override", join="outer")
-
-
-def _median_errors(fitted: Dataset) -> Dataset:
-    """Medians over the surfels of the residuals and of the errors at held-out samples."""
-    medians = {}
-    for name in names_of(Use.MEDIAN):
-        values = fitted[name].values if name in fitted else np.zeros(0)
-        finite = values[np.isfinite(values)]
-        medians[name] = float(np.median(finite)) if finite.size else np.nan
-    return dataset(
-        {variables.MEDIAN_ERROR: list(medians.values())},
-        coords={"measure": list(medians)},
-    )
+    return xr.merge([tables, fitted[index].reset_coords(drop=True)])
 
 
 def _weighted_mean(values: Array, errors: Array, weight: Array) -> tuple[Array, Array]:
@@ -246,13 +215,6 @@ def _weighted_mean(values: Array, errors: Array, weight: Array) -> tuple[Array, 
             np.sqrt((np.where(is_known, errors * weight, 0) ** 2).sum(axis=0)) / total
         )
     return mean, error
-
-
-def _covariance(colour: Array, weight: Array) -> AnyArray:
-    """Area-weighted covariance (3, 3); NaN for fewer than two surfels."""
-    if len(colour) < 2:
-        return np.full((colour.shape[1],) * 2, np.nan)
-    return np.asarray(np.cov(colour.T, aweights=weight, ddof=0))
 
 
 def cohort_of(

@@ -149,7 +149,6 @@ class Use(Flag):
     REPORTED = auto()  # median and 95 % quantile stand in the report of a fit
     EXPORTED = auto()  # median and 95 % quantile stand in the manifest of an export
     SAMPLED = auto()  # in the samples of surfels and sites that cohorts read
-    MEDIAN = auto()  # median stands in the tables that cohorts read
     MAPPED = auto()  # as texel_<name> in the maps of a registered take
     SURVIVES_EDIT = auto()  # an edited model has it; others describe the unedited one
     SURFACE = auto()  # parameter of a surface model; where it is NaN nothing was fitted

@@ -138,7 +138,7 @@ FIT_STATUS = declare(
 DICTIONARY_RESIDUAL = declare(
     "float32 fitted/dictionary_residual(surfel) [1]",
     "relative RMS residual of the fit by the whole dictionary",
-    uses=Use.REPORTED | Use.EXPORTED | Use.MEDIAN,
+    uses=Use.REPORTED | Use.EXPORTED,
 )
 DICTIONARY_RESIDUAL_PERCEPTUAL = declare(
     "float32 fitted/dictionary_residual_perceptual(surfel) [1]",
@@ -147,12 +147,12 @@ DICTIONARY_RESIDUAL_PERCEPTUAL = declare(
 FIT_RESIDUAL = declare(
     "float32 fitted/fit_residual(surfel) [1]",
     "relative RMS residual of the fit by the reduced basis",
-    uses=Use.REPORTED | Use.EXPORTED | Use.SAMPLED | Use.MEDIAN,
+    uses=Use.REPORTED | Use.EXPORTED | Use.SAMPLED,
 )
 FIT_RESIDUAL_PERCEPTUAL = declare(
     "float32 fitted/fit_residual_perceptual(surfel) [1]",
     "relative RMS residual of the fit by the reduced basis in cube-root space",
-    uses=Use.REPORTED | Use.EXPORTED | Use.SAMPLED | Use.MEDIAN,
+    uses=Use.REPORTED | Use.EXPORTED | Use.SAMPLED,
 )
 FIT_SAMPLES = declare(
     "int32 fitted/fit_samples(surfel) [1]",
@@ -180,22 +180,22 @@ KKT_RESIDUAL = declare(
 HELD_OUT_ERROR = declare(
     "float32 fitted/held_out_error(surfel) [1]",
     "relative RMS error of predicted samples under held-out lights, in the fitted cameras",
-    uses=Use.REPORTED | Use.EXPORTED | Use.SAMPLED | Use.MEDIAN,
+    uses=Use.REPORTED | Use.EXPORTED | Use.SAMPLED,
 )
 HELD_OUT_ERROR_PERCEPTUAL = declare(
     "float32 fitted/held_out_error_perceptual(surfel) [1]",
     "relative RMS error of predicted samples under held-out lights in cube-root space",
-    uses=Use.REPORTED | Use.MEDIAN,
+    uses=Use.REPORTED,
 )
 HELD_OUT_CAMERA_ERROR = declare(
     "float32 fitted/held_out_camera_error(surfel) [1]",
     "relative RMS error of predicted samples in held-out cameras, under the fitted lights",
-    uses=Use.REPORTED | Use.EXPORTED | Use.SAMPLED | Use.MEDIAN,
+    uses=Use.REPORTED | Use.EXPORTED | Use.SAMPLED,
 )
 HELD_OUT_CAMERA_ERROR_PERCEPTUAL = declare(
     "float32 fitted/held_out_camera_error_perceptual(surfel) [1]",
     "relative RMS error of predicted samples in held-out cameras in cube-root space",
-    uses=Use.REPORTED | Use.MEDIAN,
+    uses=Use.REPORTED,
 )
 OUTLIER_FRACTION = declare(
     "float32 fitted/outlier_fraction(surfel) [1]",
@@ -377,10 +377,6 @@ REGION_DIFFUSE_REFLECTANCE_TOTAL_ERROR = declare(
     "float64 tables/region_diffuse_reflectance_total_error(region, channel) [1]",
     "standard error of the mean with the errors that its surfels have in common",
 )
-REGION_DIFFUSE_COVARIANCE = declare(
-    "float64 tables/region_diffuse_covariance(region, channel, channel_2) [1]",
-    "area-weighted covariance of R_d between channels over the trusted surfels of the region",
-)
 REGION_SURFACE_REFLECTANCE = declare(
     "float64 tables/region_surface_reflectance(region) [1]",
     "area-weighted mean of surface_reflectance over the trusted surfels of the region",
@@ -388,13 +384,4 @@ REGION_SURFACE_REFLECTANCE = declare(
 REGION_SURFACE_REFLECTANCE_ERROR = declare(
     "float64 tables/region_surface_reflectance_error(region) [1]",
     "standard error of the mean from the independent errors of its surfels",
-)
-MEAN_BASIS_WEIGHT = declare(
-    "float64 tables/mean_basis_weight(component) [1]",
-    "area-weighted mean of basis_weight; each model has its own basis, so takes are not "
-    "comparable",
-)
-MEDIAN_ERROR = declare(
-    "float64 tables/median_error(measure) [1]",
-    "median over surfels of residuals and of errors at held-out lights and cameras",
 )

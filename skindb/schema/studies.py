@@ -583,44 +583,6 @@ GROUP_CHROMOPHORE_STANDARD_DEVIATION = declare(
     "standard deviation between subjects",
 )
 
-# mean_face
-FACE_DIFFUSE_REFLECTANCE = declare(
-    "float32 mean_face/face_diffuse_reflectance(v, u, channel) [1]",
-    "geometric mean of R_d over subjects",
-)
-FACE_DIFFUSE_REFLECTANCE_LOG_DEVIATION = declare(
-    "float32 mean_face/face_diffuse_reflectance_log_deviation(v, u, channel) [1]",
-    "standard deviation of ln R_d between subjects",
-)
-FACE_DIFFUSE_REFLECTANCE_COUNT = declare(
-    "int32 mean_face/face_diffuse_reflectance_count(v, u) [1]",
-    "subjects whose R_d is measured there",
-)
-FACE_SIGMA_TR = declare(
-    "float32 mean_face/face_sigma_tr(v, u, channel) [mm-1]",
-    "geometric mean of sigma_tr over subjects",
-)
-FACE_SIGMA_TR_LOG_DEVIATION = declare(
-    "float32 mean_face/face_sigma_tr_log_deviation(v, u, channel) [1]",
-    "standard deviation of ln sigma_tr between subjects",
-)
-FACE_SIGMA_TR_COUNT = declare(
-    "int32 mean_face/face_sigma_tr_count(v, u) [1]",
-    "subjects whose sigma_tr is known there",
-)
-FACE_SURFACE_REFLECTANCE = declare(
-    "float32 mean_face/face_surface_reflectance(v, u) [1]",
-    "mean surface reflectance over subjects",
-)
-FACE_SURFACE_REFLECTANCE_DEVIATION = declare(
-    "float32 mean_face/face_surface_reflectance_deviation(v, u) [1]",
-    "standard deviation of surface reflectance between subjects",
-)
-FACE_SURFACE_REFLECTANCE_COUNT = declare(
-    "int32 mean_face/face_surface_reflectance_count(v, u) [1]",
-    "subjects whose surface is measured there",
-)
-
 # coverage
 COVERAGE_COUNT = declare(
     "int32 coverage/coverage_count(cell) [1]",
