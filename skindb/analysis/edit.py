@@ -342,7 +342,7 @@ def _moved_albedo(
     values = decorrelate(colour[good], mean, axes)
     here = histogram(np.clip(values, edges[:, 0], edges[:, -1]), area, edges)
     source = quantiles(here, edges)
-    step = valid_quantiles(source + shift) - source
+    step = valid_quantiles(float64(source + shift)) - source
     matched = [
         shift_quantiles(values[:, a], here[a], step[a], edges[a]) for a in range(3)
     ]
