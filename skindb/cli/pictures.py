@@ -139,7 +139,6 @@ def compare(
     """Compare the kept photographs with renderings of the model.
 
     The measures are RMSE, PSNR, SSIM and CIEDE2000 for each photograph that ingest kept.
-    With --json, the figures of each region are printed too.
     """
     comparisons = skindb.workflow.compare_take(
         existing(db), take, generation=generation, **vars(parameters)
@@ -153,7 +152,6 @@ def compare(
             "held_out": c.held_out,
             **c.error,
             "filled": c.filled,
-            "regions": c.regions,
         }
         for c in comparisons
     ]

@@ -56,6 +56,7 @@ class Scan:
 
     vertices: Float64  # (v, 3) mm
     faces: Index  # (f, 3)
+    colours: Bytes | None = None  # (v, 3) of a PLY file with colours of 8 bits, sRGB
 
 
 def read_scan(path: str | Path) -> Scan:
@@ -85,7 +86,7 @@ def read_scan(path: str | Path) -> Scan:
         raise _fault(file, rule, file.suffix or "no suffix")
     try:
         with open_regular(file, MAX_SCAN_BYTES) as stream:
-            vertices, faces = reader(stream)
+            scan = reader(stream)
     except InputError:
         raise
     except OSError as error:
@@ -94,29 +95,9 @@ def read_scan(path: str | Path) -> Scan:
     except DAMAGE as error:
         rule = "the scan must be a complete mesh file"
         raise _fault(file, rule, _damage(error)) from error
-    if faults := _faults(str(file), vertices, faces):
+    if faults := _faults(str(file), scan.vertices, scan.faces):
         raise InputError(faults)
-    return Scan(vertices, faces)
-
-
-def read_colours(path: str | Path, count: int) -> Bytes | None:
-    """Colours (count, 3) of the vertices of a PLY file that `read_scan` has read; None
-    where it has none of 8 bits.
-    """
-    file = Path(path)
-    if file.suffix.lower() != ".ply":
-        return None
-    with open_regular(file, MAX_SCAN_BYTES) as stream:
-        content = load_ply(stream, fix_texture=False, skip_materials=True)
-    colours = content.get("vertex_colors")
-    if colours is None or len(colours) != count:
-        return None
-    colours = np.asarray(colours)
-    if colours.dtype.kind not in "iu":
-        return None
-    if np.max(colours, initial=0) > MAX_COLOUR or np.min(colours) < 0:
-        return None
-    return colours[:, :3].astype(np.uint8)
+    return scan
 
 
 def _damage(error: Exception) -> str:
@@ -150,7 +131,7 @@ def _faults(file: str, vertices: Array, faces: Index) -> list[Fault]:
     return faults
 
 
-def _read_ply(stream: BinaryIO) -> tuple[Float64, Index]:
+def _read_ply(stream: BinaryIO) -> Scan:
     _require_counts(stream)
     # fix_texture would split vertices along texture seams and so renumber them
     content = load_ply(stream, fix_texture=False, skip_materials=True)
@@ -159,8 +140,12 @@ def _read_ply(stream: BinaryIO) -> tuple[Float64, Index]:
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise DamageError(f"vertices of shape {vertices.shape}")
     if faces.ndim == 2 and faces.shape[1] != 3:
-        return vertices, _triangulated(list(faces), vertices)
-    return vertices, faces.reshape(-1, 3)
+        faces = _triangulated(list(faces), vertices)
+    colours = np.asarray(content.get("vertex_colors", ()))
+    is_coloured = colours.shape[:1] == vertices.shape[:1] and colours.dtype.kind in "iu"
+    if not is_coloured or not ((colours >= 0) & (colours <= MAX_COLOUR)).all():
+        return Scan(vertices, faces.reshape(-1, 3))
+    return Scan(vertices, faces.reshape(-1, 3), colours[:, :3].astype(np.uint8))
 
 
 def _require_counts(stream: BinaryIO) -> None:
@@ -195,7 +180,7 @@ def _require_counts(stream: BinaryIO) -> None:
     stream.seek(0)
 
 
-def _read_obj(stream: BinaryIO) -> tuple[Float64, Index]:
+def _read_obj(stream: BinaryIO) -> Scan:
     """Positions and faces only: general readers split or reorder vertices where texture
     coordinates differ.
     """
@@ -220,8 +205,9 @@ def _read_obj(stream: BinaryIO) -> tuple[Float64, Index]:
     points = np.array(vertices, np.float64).reshape(-1, 3)
     numbers = np.array(corners, np.int64)
     if all(size == 3 for size in sizes):
-        return points, numbers.reshape(-1, 3)
-    return points, _triangulated(np.split(numbers, np.cumsum(sizes)[:-1]), points)
+        return Scan(points, numbers.reshape(-1, 3))
+    polygons = np.split(numbers, np.cumsum(sizes)[:-1])
+    return Scan(points, _triangulated(polygons, points))
 
 
 def _obj_lines(stream: BinaryIO) -> Iterator[tuple[bytes, bytes]]:

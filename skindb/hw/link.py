@@ -271,7 +271,6 @@ class Link:
     ) -> None:
         self.name = name
         self.clock = clock
-        self.lost_events = 0
         self._port = port
         self._lines = Lines()
         self._number = 0
@@ -428,19 +427,16 @@ class Link:
         return reply
 
     def _store_event(self, event: Message) -> None:
-        skipped = 0
-        if self._next_event is not None:
-            skipped = (event.number - self._next_event) % MAX_NUMBER
+        due = self._next_event
         if self._disorder:
             return
-        if skipped > MAX_NUMBER // 2:
-            self._disorder = f"event {event.number} where {self._next_event} was due"
+        if due is not None and (event.number - due) % MAX_NUMBER > MAX_NUMBER // 2:
+            self._disorder = f"event {event.number} where {due} was due"
         elif len(self._events) >= MAX_WAITING_EVENTS:
             self._disorder = (
                 f"more than {MAX_WAITING_EVENTS} events that were not asked for"
             )
         else:
-            self.lost_events += skipped
             self._next_event = event.number % MAX_NUMBER + 1
             self._events.append(event)
 

@@ -41,7 +41,6 @@ from skindb.types import Array, Bytes, Float32, Float64, Mask, finite_rows, floa
 SSIM_WINDOW = 7
 Float = Float64
 Image = Array
-MIN_REGION_PIXELS = 30  # below which a region is not compared
 # fraction of a pixel's rays that must meet the surface, to exclude silhouettes
 MIN_COVERAGE = 0.999
 
@@ -162,7 +161,6 @@ class Comparison:
     filled: float
     error: dict[str, float]  # from `compare_images`
     diffuse: Float32  # (h, w, 3) diffuse part of the rendering
-    regions: dict[str, dict[str, float]]  # the same errors for each region, by its name
 
 
 def compare_photographs(
@@ -210,7 +208,6 @@ def _compared(
     # of the model, as its intensities contain the estimated gains
     lights = lights_from_dome(model["dome"].to_dataset())
     unseen_lights, unseen_cameras = (_held_out(model, d) for d in ("light", "camera"))
-    regions = _regions(capture)
     is_filled = surfel_confidence(model["fitted"].to_dataset()) == 0
     for photograph in photographs:
         at_light = int(photograph[variables.PHOTOGRAPH_LIGHT])
@@ -234,7 +231,6 @@ def _compared(
         is_unseen = light in unseen_lights or name in unseen_cameras
         error = compare_images(rendered, photo, mask=mask)
         filled = view.image(view.interpolate(is_filled[:, None]))[..., 0]
-        by_region = _by_region(view, regions, rendered, photo, mask, error["exposure"])
         yield Comparison(
             light,
             name,
@@ -245,7 +241,6 @@ def _compared(
             float(filled[mask].mean()),
             error,
             diffuse,
-            by_region,
         )
 
 
@@ -284,45 +279,6 @@ def _kept_photographs(capture: xr.DataTree) -> list[xr.Dataset]:
     return [
         photographs.isel(photograph=i) for i in range(photographs.sizes["photograph"])
     ]
-
-
-def _regions(capture: xr.DataTree) -> dict[str, Float64]:
-    """Membership (surfel,) of the regions that the capture names."""
-    surfels = (
-        capture["surfels"].to_dataset()
-        if "surfels" in capture.children
-        else xr.Dataset()
-    )
-    if variables.REGION_MASK not in surfels:
-        return {}
-    mask = (
-        surfels[variables.REGION_MASK]
-        .transpose("surfel", "region")
-        .values.astype(np.float64)
-    )
-    return {str(name): mask[:, i] for i, name in enumerate(surfels["region"].values)}
-
-
-def _by_region(
-    view: View,
-    regions: dict[str, Float64],
-    rendered: Float32,
-    photo: Float32,
-    mask: Mask,
-    exposure: float,
-) -> dict[str, dict[str, float]]:
-    """Differences in the pixels of each region, at the exposure of the whole picture."""
-    if not regions:
-        return {}
-    membership = view.image(view.interpolate(np.stack(list(regions.values()), axis=1)))
-    errors = {}
-    for i, name in enumerate(regions):
-        inside = mask & (membership[..., i] > 0.5)
-        if inside.sum() >= MIN_REGION_PIXELS:
-            errors[name] = compare_images(
-                rendered, photo, mask=inside, exposure=exposure
-            )
-    return errors
 
 
 def _held_out(model: xr.DataTree, dim: str) -> set[str]:

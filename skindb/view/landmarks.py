@@ -29,9 +29,9 @@ from skindb.format.scan_checks import (
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.geometry.landmarks import MEAN_FACE, suggest_landmarks
 from skindb.geometry.mesh import closest_on_mesh, vertex_normals
-from skindb.geometry.scan import Crop, Scan, read_colours, read_scan
+from skindb.geometry.scan import Crop, Scan, read_scan
 from skindb.limits import MAX_JSON_BYTES
-from skindb.types import Bytes, Float64
+from skindb.types import Float64
 from skindb.view.page import HTML, Content, PageServer, embedded_json, page_text
 
 Points = Mapping[str, Float64]
@@ -72,7 +72,6 @@ class LandmarkTask:
     out: Path  # landmarks.json
     scan: Scan
     surface: CleanMesh  # the part of the scan that ingest keeps
-    colours: Bytes | None  # (v, 3), sRGB
     points: Points  # landmarks in the file [mm]
     crop: Crop | None
 
@@ -99,8 +98,7 @@ def landmark_task(scan_path: Path, out: Path) -> LandmarkTask:
     )
     scan = read_scan(scan_path)
     surface = clean_mesh(scan.vertices, scan.faces)
-    colours = read_colours(scan_path, len(scan.vertices))
-    return reread_task(LandmarkTask(scan_path, out, scan, surface, colours, {}, None))
+    return reread_task(LandmarkTask(scan_path, out, scan, surface, {}, None))
 
 
 def reread_task(task: LandmarkTask) -> LandmarkTask:
@@ -351,7 +349,7 @@ def _mesh(task: LandmarkTask) -> bytes:
     normal = np.nan_to_num(vertex_normals(vertices, faces))
     parts = [vertices.astype("<f4"), normal.astype("<f4"), faces.astype("<u4")]
     return b"".join(part.tobytes() for part in parts) + (
-        b"" if task.colours is None else task.colours.tobytes()
+        b"" if task.scan.colours is None else task.scan.colours.tobytes()
     )
 
 
@@ -360,7 +358,7 @@ def _page(task: LandmarkTask) -> str:
     task_record = {
         "vertices": len(task.scan.vertices),
         "faces": len(task.scan.faces),
-        "colours": task.colours is not None,
+        "colours": task.scan.colours is not None,
         "names": {name: place_sentence(name) for name in task.names},
         "points": {name: p.tolist() for name, p in task.points.items()},
         "crop": None if box is None else {"low": box.low, "high": box.high},

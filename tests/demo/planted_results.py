@@ -103,7 +103,7 @@ def comparison(light: str, *, held_out: bool, exposure: float = 1.0) -> Comparis
         "delta_e_median": 1.2,
         "exposure": exposure,
     }
-    return Comparison(light, "c0", held_out, image, image, mask, 0.0, error, image, {})
+    return Comparison(light, "c0", held_out, image, image, mask, 0.0, error, image)
 
 
 def _studies(takes: tuple[str, ...]) -> dict[str, xr.DataTree]:

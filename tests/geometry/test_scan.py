@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from skindb.errors import InputError
-from skindb.geometry.scan import Crop, crop_faces, read_colours, read_scan
+from skindb.geometry.scan import Crop, crop_faces, read_scan
 
 OBJ = """# units mm
 mtllib ../../elsewhere.mtl
@@ -168,11 +168,11 @@ def test_read_scan__quads_are_cut_along_the_shorter_diagonal(tmp_path):
         assert doubled.sum() / 2 == pytest.approx(18)
 
 
-def test_read_colours__of_a_file_with_and_without(tmp_path):
+def test_read_scan__colours_of_a_file_with_and_without(tmp_path):
     ball = trimesh.creation.icosphere(1)
     ball.export(tmp_path / "plain.ply")
-    assert read_colours(tmp_path / "plain.ply", len(ball.vertices)) is None
-    assert read_colours(tmp_path / "scan.obj", len(ball.vertices)) is None
+    assert read_scan(tmp_path / "plain.ply").colours is None
+    assert read_scan(save(tmp_path, "scan.obj", OBJ)).colours is None
     colours = (
         np.random.default_rng(0)
         .integers(0, 256, (len(ball.vertices), 4))
@@ -182,13 +182,10 @@ def test_read_colours__of_a_file_with_and_without(tmp_path):
     trimesh.Trimesh(
         ball.vertices, ball.faces, vertex_colors=colours, process=False
     ).export(path)
-    np.testing.assert_array_equal(
-        read_colours(path, len(ball.vertices)), colours[:, :3]
-    )
-    assert read_colours(path, len(ball.vertices) + 1) is None
+    np.testing.assert_array_equal(read_scan(path).colours, colours[:, :3])
 
 
-def test_read_colours__of_numbers_that_are_not_of_eight_bits(tmp_path):
+def test_read_scan__colours_that_are_not_of_eight_bits(tmp_path):
     head = (
         "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float "
         "y\nproperty float z\n"
@@ -205,8 +202,9 @@ def test_read_colours__of_numbers_that_are_not_of_eight_bits(tmp_path):
             f"{head}{colour}element face 1\nproperty list uchar int "
             f"vertex_indices\nend_header\n{rows}3 0 1 2\n"
         )
-        assert len(read_scan(path).faces) == 1
-        assert read_colours(path, 3) is None
+        scan = read_scan(path)
+        assert len(scan.faces) == 1
+        assert scan.colours is None
 
 
 BALL = trimesh.creation.icosphere(2, radius=80.0)
