@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SUBJECT = "subject"
+BASELINE = "baseline"
 RESIDUAL = "residual"
 MODELLED = (*QUANTITIES, COLOUR_DIFFERENCE)
 INTERCEPT = "Intercept"
@@ -58,6 +59,7 @@ COLUMNS = (
     variables.MODEL_ESTIMATE_HIGH,
     variables.MODEL_P,
     variables.MODEL_P_FALSE_DISCOVERY,
+    variables.MODEL_P_EQUIVALENCE,
     variables.MODEL_DEGREES_OF_FREEDOM,
 )
 
@@ -111,7 +113,13 @@ class MixedModel:
         )
 
 
-def linear_model(cohort: Dataset, *, formula: str) -> Dataset:
+def linear_model(
+    cohort: Dataset,
+    *,
+    formula: str,
+    contrasts: Sequence[str] = (),
+    margin: float | None = None,
+) -> Dataset:
     """Fit a linear or mixed model to a quantity, for each region or site and channel.
 
     Parameters
@@ -122,7 +130,15 @@ def linear_model(cohort: Dataset, *, formula: str) -> Dataset:
         Quantity, or its logarithm ``log(NAME)``, ``~`` and terms of attributes, condition
         and visit, as of formulaic; perhaps with ``(1 | subject)``, or with ``(1 + NAME |
         subject)`` for slopes that differ between subjects. Takes in other conditions
-        than normal are used if the formula names the condition.
+        than normal are used if the formula names the condition. `baseline` is the value
+        of the subject's first take in the condition normal, which is no row then; its
+        logarithm if that of the quantity is explained.
+    contrasts
+        Sums of multiples of terms, such as ``treatment[T.b]:visit - treatment[T.c]:visit``,
+        which are estimated like terms.
+    margin
+        Largest magnitude of an effect that does not matter, in the unit of the quantity
+        or of its logarithm: p values are added of the hypothesis that it is larger.
 
     Returns
     -------
@@ -132,51 +148,57 @@ def linear_model(cohort: Dataset, *, formula: str) -> Dataset:
         Student's intervals and p values with the degrees of freedom between subjects
         for terms that are constant within subjects or have random slopes, and within
         subjects for others. Terms of one number are per unit of it, those of words less
-        the first word in the alphabet. Attribute "flags".
+        the first word in the alphabet; contrasts follow them. Attribute "flags".
 
     Raises
     ------
     InputError
-        If the formula has other parts or unknown names, if no region has enough takes,
-        or if subjects have several takes and there is no random part.
+        If the formula has other parts, if formula or contrasts have unknown names, if no
+        region has enough takes, or if subjects have several takes and there is no random
+        part.
 
     References
     ----------
-    Laird and Ware 1982; Schluchter and Elashoff 1990 (degrees of freedom).
+    Laird and Ware 1982; Schluchter and Elashoff 1990 (degrees of freedom);
+    Schuirmann 1987 (equivalence).
     """
     require_comparable(cohort, "tables")
     model = MixedModel.of(formula)
     frame = tidy(cohort)
-    known = [name for name in frame.columns if name not in (*VALUES, "take")]
+    unused = {*VALUES, "take"} - {BASELINE}
+    known = [name for name in frame.columns if name not in unused]
     used = _names(model, known)
     frame = frame[frame["quantity"] == model.quantity]
     if CONDITION not in used:
         frame = frame[frame[CONDITION] == NORMAL]
     if model.is_log:
-        positive = frame["value"].where(frame["value"] > 0)
-        frame = frame.assign(value=np.log(positive))
+        numbers = frame[["value", BASELINE]]
+        frame[["value", BASELINE]] = np.log(numbers.where(numbers > 0))
     frame = _with_levels(model, frame.dropna(subset=["value", *used]))
     fits: dict[str, _Fit] = {}
     flags: list[str] = []
+    reasons: list[str] = []  # of regions without a model
     for (region, channel), part in frame.groupby(
         ["region", "channel"], sort=False, dropna=False
     ):
         words = [model.quantity, region, channel]
         name = " ".join(str(word) for word in words if isinstance(word, str))
         try:
-            fits[name] = _fit(model, part)
+            fits[name] = _fit(model, part, contrasts, margin)
         except InputError as error:
-            flags.append(f"{name}: excluded, {error.faults[0].found}")
+            reasons.append(error.faults[0].found)
+            flags.append(f"{name}: excluded, {reasons[-1]}")
         else:
             flags += [f"{name}: {flag}" for flag in fits[name].flags]
     require(
         fits,
         f"formula {formula}",
         "some region must determine it",
-        "; ".join(flags) or "no take with all its variables",
+        "; ".join(dict.fromkeys(reasons)) or "no take with all its variables",
         "use fewer terms, or add takes",
     )
-    return _labelled(model, fits, formula, flags, cohort)
+    stated = {"formula": formula, "margin": margin}
+    return _labelled(model, fits, flags, cohort, stated)
 
 
 @dataclass(frozen=True)
@@ -233,7 +255,12 @@ def _with_levels(model: MixedModel, frame: pd.DataFrame) -> pd.DataFrame:
     return frame.assign(**words)
 
 
-def _fit(model: MixedModel, rows: pd.DataFrame) -> _Fit:
+def _fit(
+    model: MixedModel,
+    rows: pd.DataFrame,
+    contrasts: Sequence[str] = (),
+    margin: float | None = None,
+) -> _Fit:
     """Fit a model to the rows of one region and channel, which lack no value."""
     # takes longer to import than most commands to run
     from formulaic import model_matrix
@@ -300,18 +327,9 @@ def _fit(model: MixedModel, rows: pd.DataFrame) -> _Fit:
     estimate, covariance, spread = _solve(
         y / scale, x, subjects, random if model.is_mixed else None
     )
-    error = scale * np.sqrt(np.diag(covariance))
-    half = stats.t.ppf(0.975, free) * error
-    estimate = scale * estimate
-    columns = (
-        estimate,
-        error,
-        estimate - half,
-        estimate + half,
-        2 * stats.t.sf(np.abs(estimate / error), free),
-        free,
+    table = _inference(
+        (scale * estimate, scale**2 * covariance, free), terms, contrasts, margin
     )
-    names = [name for name in COLUMNS if name != variables.MODEL_P_FALSE_DISCOVERY]
     effects = [INTERCEPT, *model.slopes] if model.is_mixed else []
     size = np.sqrt((random**2).mean(axis=0))  # whatever the units of the slopes are
     at_bound = [
@@ -320,12 +338,60 @@ def _fit(model: MixedModel, rows: pd.DataFrame) -> _Fit:
         if value**2 < BOUND * spread[-1] ** 2
     ]
     return _Fit(
-        pd.DataFrame(dict(zip(names, columns, strict=True)), terms),
+        table,
         dict(zip([*effects, RESIDUAL], scale * spread, strict=True)),
         len(rows),
         people,
         tuple(f"no variance of {effect} between subjects" for effect in at_bound),
     )
+
+
+def _inference(
+    fitted: tuple[Array, Array, Array],
+    terms: Sequence[str],
+    contrasts: Sequence[str],
+    margin: float | None,
+) -> pd.DataFrame:
+    """Variables of terms and contrasts, from estimates, covariance and degrees of freedom."""
+    estimate, covariance, free = fitted
+    sums = np.vstack(
+        [np.eye(len(terms)), *(_sum_of(name, terms) for name in contrasts)]
+    )
+    estimate = sums @ estimate
+    error = np.sqrt(np.einsum("ij,jk,ik->i", sums, covariance, sums))
+    free = np.where(sums != 0, free, np.inf).min(axis=1)
+    half = stats.t.ppf(0.975, free) * error
+    columns = {
+        variables.MODEL_ESTIMATE: estimate,
+        variables.MODEL_ERROR: error,
+        variables.MODEL_ESTIMATE_LOW: estimate - half,
+        variables.MODEL_ESTIMATE_HIGH: estimate + half,
+        variables.MODEL_P: 2 * stats.t.sf(np.abs(estimate / error), free),
+        variables.MODEL_DEGREES_OF_FREEDOM: free,
+    }
+    if margin is not None:
+        # two one-sided tests: the p value of the end of the margin that is nearer
+        inside = (margin - np.abs(estimate)) / error
+        columns[variables.MODEL_P_EQUIVALENCE] = stats.t.sf(inside, free)
+    return pd.DataFrame(columns, [*terms, *contrasts])
+
+
+def _sum_of(contrast: str, terms: Sequence[str]) -> Array:
+    """Factors (terms,) of the terms in a contrast."""
+    from patsy import DesignInfo, PatsyError
+
+    try:
+        found = DesignInfo(terms).linear_constraint(contrast)
+    except (PatsyError, IndexError):  # the latter for an empty text
+        found = None
+    require(
+        found is not None and len(found.coefs) == 1 and not found.constants.any(),
+        f"contrast {contrast}",
+        "must be a sum of multiples of terms",
+        f"contrast {contrast} is not a sum of multiples of {', '.join(terms)}",
+        "write, for example: NAME - 2 * NAME",
+    )
+    return np.asarray(found.coefs[0], float)
 
 
 def _numbers(rows: pd.DataFrame, name: str) -> Array:
@@ -378,9 +444,9 @@ def _solve(
 def _labelled(
     model: MixedModel,
     fits: dict[str, _Fit],
-    formula: str,
     flags: list[str],
     cohort: Dataset,
+    stated: dict[str, str | float | None],
 ) -> Dataset:
     """The Dataset of all models."""
     terms = list(
@@ -408,7 +474,7 @@ def _labelled(
         },
         coords={"quantity": list(fits), "term": terms, "effect": effects},
         attrs={
-            "formula": formula,
+            **stated,
             "condition": "" if CONDITION in _words(model) else NORMAL,
             "flags": flags,
             "skipped": skipped_takes(cohort),
@@ -427,7 +493,8 @@ def tabulate_model(table: Dataset) -> Table:
         name: table[name].broadcast_like(table[variables.MODEL_ESTIMATE])
         for name in (variables.MODEL_TAKES, variables.MODEL_SUBJECTS)
     }
-    return table_of(table.assign(counts), [*COLUMNS, *counts], ("quantity", "term"))
+    known = [name for name in COLUMNS if name in table]
+    return table_of(table.assign(counts), [*known, *counts], ("quantity", "term"))
 
 
 def describe_model(table: Dataset) -> list[str]:
@@ -443,6 +510,11 @@ def describe_model(table: Dataset) -> list[str]:
     interval = (
         "low and high are the ends of 95 % intervals, p values are of one region alone"
     )
+    if table.attrs["margin"] is not None:
+        interval += (
+            "; p of equivalence is that of the hypothesis that an effect is not within "
+            f"+-{table.attrs['margin']:g}"
+        )
     return [*lines, interval, *table.attrs["flags"]]
 
 
@@ -485,11 +557,23 @@ class Parameters:
         MISSING,
         "Formula, such as: ITA ~ treatment * visit + age + (1 | subject).",
     )
+    contrasts: tuple[str, ...] = option(
+        (),
+        "Sums of multiples of terms to estimate, separated by commas.",
+        metavar="TERMS,...",
+        show_default=False,
+    )
+    margin: float | None = option(
+        None,
+        "Largest effect that does not matter, for tests of equivalence.",
+        minimum=1e-9,
+        maximum=1e9,
+    )
 
 
 def compute(population: Population, parameters: Parameters) -> Results:
     """The results of the study."""
-    return {"linear_model": linear_model(population.cohort, formula=parameters.formula)}
+    return {"linear_model": linear_model(population.cohort, **vars(parameters))}
 
 
 STUDY = Study(

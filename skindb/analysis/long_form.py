@@ -21,7 +21,7 @@ from skindb.analysis.quantities import (
 from skindb.analysis.subjects import CONDITION, NORMAL, subjects_of
 from skindb.errors import require
 from skindb.schema.cohort import require_takes, visit_of
-from skindb.types import Array
+from skindb.types import Array, Index, Mask
 
 KEYS = ("take", "subject", CONDITION, "visit", "repeat")
 COLUMNS = (
@@ -31,6 +31,7 @@ COLUMNS = (
     "value",
     "error",
     "common_error",
+    "baseline",
     "unit",
     "status",
     "label",
@@ -52,10 +53,11 @@ def tidy(cohort: Dataset) -> pd.DataFrame:
         sites of the probe; channel (R, G, B, or missing); value, NaN where there is
         none to be trusted, in `unit`; `error`, its standard error without
         `common_error`, the errors of level and model, which are taken to be the same
-        for all takes; status; label (the class of an individual typology angle); and
-        each attribute of the captures, as ``attribute_<name>`` if it has the name of
-        another column. Takes without a white target have R_d with the status
-        "relative" and no colours.
+        for all takes; `baseline`, the value of the subject's first take in the condition
+        normal, NaN for that take itself; status; label (the class of an individual
+        typology angle); and each attribute of the captures, as ``attribute_<name>`` if
+        it has the name of another column. Takes without a white target have R_d with
+        the status "relative" and no colours.
 
         Quantities: R_d, surface reflectance and sigma_tr; CIELAB L*, a*, b*, individual
         typology angle (ITA), melanin index and erythema index of R_d, see
@@ -91,17 +93,33 @@ def tidy(cohort: Dataset) -> pd.DataFrame:
         "neither",
         "add landmarks or a probe to the captures",
     )
-    rows = [_rows(one) for one in [*measured, *_differences(measured, takes)]]
+    baseline = _baseline(takes)
+    compared = [*measured, *_differences(measured, baseline)]
+    rows = [_rows(one, baseline) for one in compared]
     table = takes.merge(pd.concat(rows), left_index=True, right_index=True)
     return table[[*KEYS, *COLUMNS, *attributes]].reset_index(drop=True)
 
 
-def _rows(measured: Measurement) -> pd.DataFrame:
+def _baseline(takes: pd.DataFrame) -> Index:
+    """Number (take,) of the first take of each subject in the condition normal, or -1."""
+    normal = takes[takes[CONDITION] == NORMAL].sort_values(["visit", "repeat"])
+    first = dict(zip(normal["subject"][::-1], normal.index[::-1], strict=True))
+    return np.array([first.get(subject, -1) for subject in takes["subject"]])
+
+
+def _has_baseline(baseline: Index) -> Mask:
+    """Whether (take,) there is a baseline that is another take."""
+    return np.asarray((baseline >= 0) & (baseline != np.arange(len(baseline))))
+
+
+def _rows(measured: Measurement, baseline: Index) -> pd.DataFrame:
     """Rows of a quantity, whose index is the number of the take."""
     quantity = measured.quantity
     labels = [*itertools.product(*measured.labels)]
     count = len(measured.values)
     values = measured.values.ravel()
+    before = measured.values[baseline]
+    before[~_has_baseline(baseline)] = np.nan
     is_angle = quantity.name == TYPOLOGY_ANGLE
     columns = (
         quantity.name,
@@ -110,6 +128,7 @@ def _rows(measured: Measurement) -> pd.DataFrame:
         values,
         measured.errors.ravel(),
         np.nan_to_num(measured.common.ravel()),
+        before.ravel(),
         quantity.unit,
         measured.status.ravel(),
         [typology_class(value) if is_angle else "" for value in values.tolist()],
@@ -118,17 +137,12 @@ def _rows(measured: Measurement) -> pd.DataFrame:
     return pd.DataFrame(dict(zip(COLUMNS, columns, strict=True)), index)
 
 
-def _differences(
-    measured: list[Measurement], takes: pd.DataFrame
-) -> Iterator[Measurement]:
+def _differences(measured: list[Measurement], baseline: Index) -> Iterator[Measurement]:
     """Differences of colour to the first take of each subject in the condition normal."""
     reflectance = next((one for one in measured if one.quantity == REFLECTANCE), None)
     if reflectance is None:
         return
-    normal = takes[takes[CONDITION] == NORMAL].sort_values(["visit", "repeat"])
-    first = dict(zip(normal["subject"][::-1], normal.index[::-1], strict=True))
-    baseline = np.array([first.get(subject, -1) for subject in takes["subject"]])
-    is_compared = (baseline >= 0) & (baseline != takes.index)
+    is_compared = _has_baseline(baseline)
     is_absolute = (reflectance.status != "relative").all(axis=(1, 2))
     is_compared &= is_absolute & is_absolute[baseline]
     before = reflectance.values[baseline]
@@ -150,7 +164,9 @@ def _differences(
     values[~is_compared] = np.nan
     errors[~is_compared] = np.nan
     absent = np.where(is_compared, "missing", "no baseline")[:, None]
-    absent = np.where((baseline == takes.index)[:, None], "baseline", absent)
+    absent = np.where(
+        (baseline == np.arange(len(baseline)))[:, None], "baseline", absent
+    )
     words = np.where(np.isfinite(values), "fitted", absent)
     yield Measurement(
         replace(REFLECTANCE, name=COLOUR_DIFFERENCE, dims=("region",)),

@@ -397,6 +397,11 @@ MODEL_P_FALSE_DISCOVERY = declare(
     "term are none",
     "Benjamini and Hochberg 1995",
 )
+MODEL_P_EQUIVALENCE = declare(
+    "float64 linear_model/model_p_equivalence(quantity, term) [1]",
+    "p value of the hypothesis that the magnitude of the effect is larger than the margin",
+    "Schuirmann 1987",
+)
 MODEL_DEGREES_OF_FREEDOM = declare(
     "float64 linear_model/model_degrees_of_freedom(quantity, term) [1]",
     "degrees of freedom of the p value, between or within subjects",

@@ -10,6 +10,7 @@ import pytest
 import statsmodels.formula.api as smf
 from planted_tables import planted_tables
 from scipy import stats
+from statsmodels.stats.weightstats import ttost_ind
 
 from skindb.analysis import linear_model, tidy
 from skindb.analysis.formula_models import MixedModel, _fit
@@ -151,6 +152,70 @@ def test_linear_model__without_a_random_part_is_least_squares():
     np.testing.assert_allclose(ours["model_p"], theirs.pvalues[terms])
 
 
+def test_linear_model__contrasts_and_equivalence_are_those_of_statsmodels():
+    cohort = planted(effect=0.002).isel(take=slice(0, None, VISITS))
+    dose = np.array(["a", "b", "c"])[np.arange(PEOPLE) % 3]
+    cohort = cohort.assign_coords(dose=("take", dose))
+    table = linear_model(
+        cohort,
+        formula="R_d ~ dose + age",
+        contrasts=["dose[T.b] - dose[T.c]", "dose[T.b] + 10*age"],
+    ).sel(quantity="R_d face G")
+    frame = tidy(cohort).query(
+        "quantity == 'R_d' and region == 'face' and channel == 'G'"
+    )
+    theirs = smf.ols("value ~ dose + age", frame).fit()
+    for name in table["term"].values.tolist()[-2:]:
+        one = theirs.t_test(name)
+        ours = table.sel(term=name)
+        assert float(ours["model_estimate"]) == pytest.approx(one.effect.item())
+        assert float(ours["model_p"]) == pytest.approx(one.pvalue.item())
+        ends = [ours["model_estimate_low"], ours["model_estimate_high"]]
+        np.testing.assert_allclose(ends, one.conf_int()[0])
+    two = linear_model(cohort, formula="R_d ~ treatment", margin=0.03)
+    ours = two.sel(quantity="R_d face G", term="treatment[T.none]")
+    groups = [part.value.to_numpy() for _, part in frame.groupby("treatment")]
+    p = ttost_ind(*groups, -0.03, 0.03)[0]
+    assert float(ours["model_p_equivalence"]) == pytest.approx(p)
+
+
+def test_linear_model__contrasts_have_the_fewest_degrees_of_freedom_of_their_terms():
+    table = linear_model(
+        planted(),
+        formula=FORMULA,
+        contrasts=["visit + treatment[T.none]:visit", "treatment[T.none] + visit"],
+    )
+    assert table["model_degrees_of_freedom"].isel(quantity=0)[-2:].values.tolist() == [
+        70,
+        21,
+    ]
+
+
+@pytest.mark.filterwarnings("ignore:The MLE may be")  # the intercepts are explained
+def test_linear_model__adjusts_for_the_baseline():
+    """As statsmodels, with the first visit as a column instead of rows."""
+    cohort = planted(effect=0.002)
+    table = linear_model(
+        cohort, formula="R_d ~ treatment + baseline + (1 | subject)"
+    ).sel(quantity="R_d face G")
+    values = tidy(cohort).query(
+        "quantity == 'R_d' and region == 'face' and channel == 'G'"
+    )
+    first = values[values.visit == 1].set_index("subject").value
+    rows = values[values.visit > 1].assign(
+        before=lambda rows: first[rows.subject].to_numpy()
+    )
+    assert int(table["model_takes"]) == PEOPLE * (VISITS - 1) == len(rows)
+    theirs = smf.mixedlm("value ~ treatment + before", rows, groups="subject").fit(
+        method="powell"
+    )
+    np.testing.assert_allclose(
+        table["model_estimate"].sel(term="baseline"),
+        theirs.fe_params["before"],
+        rtol=1e-3,
+    )
+
+
 def test_linear_model__of_colour_differences():
     """The first visit is the baseline, and no row."""
     table = linear_model(planted(), formula="delta E ~ visit + (1 | subject)")
@@ -205,6 +270,16 @@ def test_linear_model__no_variance_between_subjects_is_flagged():
 def test_linear_model__refuses(formula, said):
     with pytest.raises(InputError, match=said):
         linear_model(planted(), formula=formula)
+
+
+@pytest.mark.parametrize(
+    "contrast", ["height", "age * age", "age = 1", "age, visit", "3", ""]
+)
+def test_linear_model__refuses_contrasts(contrast):
+    with pytest.raises(InputError, match="not a sum of multiples of Intercept, age"):
+        linear_model(
+            planted(), formula="R_d ~ age + (1 | subject)", contrasts=[contrast]
+        )
 
 
 @pytest.mark.parametrize(

@@ -148,6 +148,12 @@ def test_tidy__columns(cohort):
     assert row.attribute_unit == "a"
     assert row.value == SKIN[1, 1]
     assert (row.error, row.common_error) == pytest.approx((ERROR, LEVEL))
+    of_take = face(frame, "R_d")[face(frame, "R_d").channel == "R"].set_index("take")
+    first = SKIN[0, 0]
+    np.testing.assert_array_equal(
+        of_take.baseline[["S1", "S1.normal.2", "S1.lotion", "S2"]],
+        [np.nan, first, first, np.nan],
+    )
     surface = frame[frame.quantity == "surface reflectance"]
     assert surface.error.isna().all()  # none is stated
     named = cohort.assign_coords(region=["face", "nose"])
