@@ -126,14 +126,18 @@ def trait_vectors(
     """
     require_comparable(cohort, "tables")
     subjects = subjects_of(cohort)
-    numbers = numeric_attributes(subjects)
-    split = _split_takes(subjects, traits, numbers)
+    split = _split_takes(subjects, traits)
     require_adjustable(subjects, adjust)
-    units, flags = _determined_units(
-        subjects, split, adjust, numbers, skip=traits is None
-    )
-    log_tr = _log_sigma_tr(cohort)
-    values = _compared_values(cohort, basis, albedo, log_tr, texture)
+    units: dict[str, Units] = {}
+    flags = []
+    for name, (carries, lacks) in split.items():
+        try:
+            units[name] = _units(subjects, name, carries, lacks, adjust)
+        except InputError as error:
+            if traits is not None:
+                raise
+            flags.append(f"excluded: {error}")
+    values = _compared_values(cohort, basis, albedo, texture)
     rng = np.random.default_rng(0) if rng is None else rng
     counts = np.array([[mask.sum() for mask in split[name]] for name in units])
     counts = counts.reshape(len(units), len(SIDES))
@@ -141,8 +145,8 @@ def trait_vectors(
     return dataset(
         {
             variables.TRAIT_COUNT: counts,
-            variables.TAKE_LOG_SIGMA_TR: _mean_over_sites(log_tr),
-            **_shifts(list(units.values()), values, rng),
+            variables.TAKE_LOG_SIGMA_TR: _mean_over_sites(values[LOG_SIGMA_TR]),
+            **_shifts([*units.values()], values, rng),
         },
         coords={
             "take": cohort["take"].values.tolist(),
@@ -153,7 +157,7 @@ def trait_vectors(
             **part,
         },
         attrs={
-            "flags": flags + _flags(list(units), counts, numbers),
+            "flags": flags + _flags(list(units), counts),
             "adjust": list(adjust),
             "skipped": skipped_takes(cohort),
         },
@@ -161,9 +165,10 @@ def trait_vectors(
 
 
 def _split_takes(
-    subjects: Subjects, traits: Sequence[str] | None, numbers: Sequence[str]
+    subjects: Subjects, traits: Sequence[str] | None
 ) -> dict[str, tuple[Mask, Mask]]:
-    """Trait -> masks of the takes with and without it, of the named or of all traits.
+    """Trait -> masks of the takes with and without it, of the named or of all traits;
+    for a numeric attribute, those in the condition normal that have it, and none.
 
     Raises
     ------
@@ -171,63 +176,50 @@ def _split_takes(
         If a trait is unknown, or no take is on one of its sides.
     """
     comparable = trait_names(subjects)
+    numbers = numeric_attributes(subjects)
     names = [*comparable, *numbers]
     if traits is not None:
         valid = sorted({*known_traits(subjects), *numbers})
         names = [trait_name(name, valid) for name in traits]
-    split = {name: _sides(subjects, name, numbers) for name in names}
-    rule = "there must be takes with and without it"
-    cure = f"choose from: {', '.join(comparable) or 'none'}"
-    faults = [
-        Fault(f"trait {n}", rule, f"{w.sum()} with, {o.sum()} without", cure)
-        for n, (w, o) in split.items()
-        if not w.any() or (n not in numbers and not o.any())
-    ]
+    split = {}
+    faults = []
+    for name in names:
+        if name in numbers:
+            is_known = np.isfinite(subjects.attribute(name).numbers)
+            carries = is_known & subjects.is_normal
+            split[name] = (carries, np.zeros_like(carries))
+            able = carries.any()
+        else:
+            split[name] = carries, lacks = sides(subjects, name)
+            able = carries.any() and lacks.any()
+        if not able:
+            rule = "there must be takes with and without it"
+            finding = "{} with, {} without".format(
+                *(side.sum() for side in split[name])
+            )
+            cure = f"choose from: {', '.join(comparable) or 'none'}"
+            faults.append(Fault(f"trait {name}", rule, finding, cure))
     if faults:
         raise InputError(faults)
     return split
 
 
-def _determined_units(
-    subjects: Subjects,
-    split: Mapping[str, tuple[Mask, Mask]],
-    adjust: Sequence[str],
-    numbers: Sequence[str],
-    *,
-    skip: bool,
-) -> tuple[dict[str, Units], list[str]]:
-    """Trait -> its units; traits that the subjects do not determine are skipped with a
-    flag, or raise `InputError`.
-    """
-    units: dict[str, Units] = {}
-    flags = []
-    for name, side in split.items():
-        try:
-            units[name] = _units(subjects, name, side, adjust, numbers)
-        except InputError as error:
-            if not skip:
-                raise
-            flags.append(f"excluded: {error}")
-    return units, flags
-
-
 def _compared_values(
-    cohort: Dataset,
-    basis: Dataset,
-    albedo: Dataset,
-    log_tr: Array,
-    texture: Dataset | None,
+    cohort: Dataset, basis: Dataset, albedo: Dataset, texture: Dataset | None
 ) -> dict[str, Array]:
     """Variable of the vectors -> values (take, ...) of which it is the difference."""
     takes = cohort["take"].values
-    histograms = albedo[variables.ALBEDO_HISTOGRAM].sel(take=takes).values
     edges = albedo[variables.HISTOGRAM_EDGE].values
+    histograms = albedo[variables.ALBEDO_HISTOGRAM].sel(take=takes).values
+    log_sigma_tr = np.full((len(takes), 1, 3), np.nan)
+    if variables.SITE_SIGMA_TR in cohort:
+        sites = cohort[[variables.SITE_SIGMA_TR, variables.SITE_STATUS]].load()
+        log_sigma_tr = np.log(float64(trusted(sites, variables.SITE_SIGMA_TR).values))
+    coefficients = basis[variables.TAKE_COEFFICIENT].sel(take=takes).values
     values = {
-        variables.TRAIT_BRDF_SHIFT: basis[variables.TAKE_COEFFICIENT]
-        .sel(take=takes)
-        .values,
+        variables.TRAIT_BRDF_SHIFT: coefficients,
         variables.TRAIT_QUANTILE_SHIFT: quantiles(histograms, edges),
-        LOG_SIGMA_TR: log_tr,
+        LOG_SIGMA_TR: log_sigma_tr,
     }
     if texture is not None:
         everything = {"take": takes, "region": albedo["region"].values}
@@ -239,17 +231,19 @@ def _compared_values(
 def _shifts(
     units: Sequence[Units], values: Mapping[str, Array], rng: Generator
 ) -> dict[str, Array]:
-    """Vectors (trait, ...) of all values (take, ...), with their errors by bootstrap."""
+    """Vectors (trait, ...) of all values (take, ...), with their errors by bootstrap
+    except for textures.
+    """
+    shapes = {name: of_takes.shape[1:] for name, of_takes in values.items()}
+    shapes[LOG_SIGMA_TR] = (len(CHANNELS),)
     shifts: dict[str, list[Array]] = {name: [] for name in values}
-    errors: dict[str, list[Array]] = {
-        f"{name}_error": [] for name in values if name != variables.TRAIT_TEXTURE_SHIFT
-    }
+    errors: dict[str, list[Array]] = {name: [] for name in values}
+    errors.pop(variables.TRAIT_TEXTURE_SHIFT, None)
     for unit in units:
         count = len(unit.design)
         drawn = rng.multinomial(count, np.full(count, 1 / count), RESAMPLES)
         for name, of_takes in values.items():
-            with_errors = name != variables.TRAIT_TEXTURE_SHIFT
-            resamples = drawn[: None if with_errors else 0].astype(float)
+            resamples = drawn[: RESAMPLES if name in errors else 0].astype(float)
             shift, resampled = _coefficients(
                 unit.values(of_takes), unit.design, resamples
             )
@@ -257,45 +251,30 @@ def _shifts(
             # trait
             if name == LOG_SIGMA_TR:
                 shift = known_mean(shift)
-                resampled = known_mean(np.moveaxis(resampled, 1, 0))
+                resampled = _mean_over_sites(resampled)
             shifts[name].append(shift)
-            if with_errors:
-                errors[f"{name}_error"].append(_deviation(resampled))
-    stacked = {}
-    for name, rows in (shifts | errors).items():
-        variable = name.removesuffix("_error")
-        shape = (3,) if variable == LOG_SIGMA_TR else values[variable].shape[1:]
-        stacked[name] = np.stack(rows) if rows else np.empty((0, *shape))
-    return stacked
-
-
-def _sides(subjects: Subjects, trait: str, numbers: Sequence[str]) -> tuple[Mask, Mask]:
-    """Masks of takes with and without a trait; for a numeric attribute, those in the
-    condition normal that have it.
-    """
-    if trait not in numbers:
-        return sides(subjects, trait)
-    is_known = np.isfinite(subjects.attribute(trait).numbers) & subjects.is_normal
-    return is_known, np.zeros(len(is_known), bool)
+            if name in errors:
+                errors[name].append(_deviation(resampled))
+    stated = {f"{name}_error": rows for name, rows in errors.items()}
+    return {
+        name: np.reshape(rows, (len(units), *shapes[name.removesuffix("_error")]))
+        for name, rows in (shifts | stated).items()
+    }
 
 
 def _units(
-    subjects: Subjects,
-    trait: str,
-    side: tuple[Mask, Mask],
-    adjust: Sequence[str],
-    numbers: Sequence[str],
+    subjects: Subjects, trait: str, carries: Mask, lacks: Mask, adjust: Sequence[str]
 ) -> Units:
     """Subjects with and without a trait; differences within subjects if all with it
     were also measured without it.
 
     A value that a subject has on one side only is then ignored, because differences
-    between people must not appear as the trait.
+    between people must not appear as the trait. A numeric attribute is its own regressor.
     """
-    carries, lacks = side
+    is_number = not lacks.any()
     who = np.array(subjects.subject)
     pairs = sorted(set(who[carries]))
-    if trait not in numbers and set(pairs) <= set(who[lacks]):
+    if not is_number and set(pairs) <= set(who[lacks]):
         rows, rows_without = (
             tuple(mask & (who == s) for s in pairs) for mask in (carries, lacks)
         )
@@ -304,7 +283,7 @@ def _units(
     names = [*pairs, *others]
     rows = tuple((carries if s in pairs else lacks) & (who == s) for s in names)
     regressor = [1.0] * len(pairs) + [0.0] * len(others)
-    if trait in numbers:
+    if is_number:
         values = subjects.attribute(trait).numbers
         regressor = [float(values[of_subject][0]) for of_subject in rows]
     held = [subjects.by_subject(name, names).columns for name in adjust]
@@ -365,65 +344,26 @@ def _deviation(resampled: Array) -> Array:
     )
 
 
-def _flags(names: Sequence[str], counts: Array, numbers: Sequence[str]) -> list[str]:
+def _flags(names: Sequence[str], counts: Array) -> list[str]:
+    """Traits with few takes on a side; all takes of a numeric attribute are on one side."""
     flags = []
-    for name, count in zip(names, counts.tolist(), strict=True):
-        smallest = count[0] if name in numbers else min(count)
+    for name, (carries, lacks) in zip(names, counts.tolist(), strict=True):
+        smallest = min(carries, lacks) if lacks else carries
         if smallest == 1:
             flags.append(
-                f"{name}: only one take {SIDES[count.index(1)]} it, so that the "
+                f"{name}: only one take {SIDES[carries > 1]} it, so that the "
                 "vector contains an individual"
             )
         elif smallest < FEW:
-            among = (
-                f"{count[0]} takes"
-                if name in numbers
-                else f"{count[0]} takes with and {count[1]} without"
-            )
+            among = f"{carries} takes with and {lacks} without"
+            among = among if lacks else f"{carries} takes"
             flags.append(f"{name}: {among}; the vector contains individual differences")
     return flags
 
 
-def _mean_over_sites(log_tr: Array) -> Array:
-    return known_mean(np.moveaxis(log_tr, 1, 0))
-
-
-def _log_sigma_tr(cohort: Dataset) -> Array:
-    """Log sigma_tr (take, site, channel) of all sites; NaN where a take has no trusted value."""
-    if variables.SITE_SIGMA_TR not in cohort:
-        return np.full((cohort.sizes["take"], 1, 3), np.nan)
-    sites = cohort[[variables.SITE_SIGMA_TR, variables.SITE_STATUS]].load()
-    return np.log(float64(trusted(sites, variables.SITE_SIGMA_TR).values))
-
-
-def describe_traits(traits: Dataset) -> list[str]:
-    """Flags of trait vectors, and a line for each whose colours are noise.
-
-    The squared length of a measured vector is the sum of the squared length of the true
-    vector and that of its error, which is inversely proportional to the number of
-    takes.
-    """
-    lines = list(traits.attrs.get("flags", []))
-    if variables.TRAIT_QUANTILE_SHIFT_ERROR not in traits:
-        return lines
-    if FACE not in traits["region"].values:
-        return lines
-    face = traits.sel(region=FACE)
-    for name in traits["trait"].values.tolist():
-        part = face.sel(trait=name)
-        shift, error = (
-            float((part[variable] ** 2).sum(skipna=False))
-            for variable in (
-                variables.TRAIT_QUANTILE_SHIFT,
-                variables.TRAIT_QUANTILE_SHIFT_ERROR,
-            )
-        )
-        takes = int(part[variables.TRAIT_COUNT].sum())
-        if shift - error <= error / takes:
-            lines.append(
-                f"{name}: with {takes} takes, the colour vector cannot be distinguished from noise"
-            )
-    return lines
+def _mean_over_sites(values: Array) -> Array:
+    """Means (n, ...) of values (n, site, ...)."""
+    return known_mean(np.moveaxis(values, 1, 0))
 
 
 def plot_traits(traits: Dataset, *, ax: Axes | None = None) -> Axes:
@@ -452,25 +392,21 @@ def tabulate_traits(traits: Dataset) -> Table:
     """Header and one row per trait: numbers of takes, and RMS lengths of the parts of
     its vector and of their errors.
     """
-    face = (
-        traits.sel(region=FACE, drop=True)
-        if FACE in traits["region"].values
-        else traits.isel(region=0, drop=True)
-    )
-    parts = {
-        "brdf": (traits, variables.TRAIT_BRDF_SHIFT, ["component"]),
-        "colour": (face, variables.TRAIT_QUANTILE_SHIFT, ["axis", "level"]),
-        "log_sigma_tr": (traits, variables.TRAIT_LOG_SIGMA_TR_SHIFT, ["channel"]),
-    }
+    face = traits.sel(region=FACE, drop=True)
     columns = {
         f"takes_{side}": traits[variables.TRAIT_COUNT].sel(side=side, drop=True)
         for side in SIDES
     }
-    for name, (vectors, variable, dims) in parts.items():
-        for suffix, part in (("shift", variable), ("noise", f"{variable}_error")):
-            if part in vectors:
-                square = (vectors[part] ** 2).mean(dims, skipna=False)
-                columns[f"{name}_{suffix}"] = square**0.5
+    for name, variable in (
+        ("brdf", variables.TRAIT_BRDF_SHIFT),
+        ("colour", variables.TRAIT_QUANTILE_SHIFT),
+        ("log_sigma_tr", LOG_SIGMA_TR),
+    ):
+        for column, part in (("shift", variable), ("noise", f"{variable}_error")):
+            if part in face:
+                dims = [dim for dim in face[part].dims if dim != "trait"]
+                square = (face[part] ** 2).mean(dims, skipna=False)
+                columns[f"{name}_{column}"] = square**0.5
     return table_of(traits.assign(columns), list(columns), ["trait"])
 
 
@@ -519,7 +455,7 @@ STUDY = Study(
     shown=("traits",),
     tabulate=tabulate_traits,
     plot=plot_traits,
-    describe=describe_traits,
+    describe=lambda traits: traits.attrs["flags"],
     cohort_options={"surfels": SAMPLED},
     uses_registration=True,
 )

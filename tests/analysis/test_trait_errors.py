@@ -7,7 +7,6 @@ import pytest
 from planted_tables import planted_tables
 
 from skindb.analysis import trait_vectors
-from skindb.analysis.traits import describe_traits
 from skindb.errors import InputError
 from skindb.schema import dataset
 
@@ -153,32 +152,3 @@ def test_trait_vectors__what_is_held_fixed_has_no_vector():
         match="adjust wealth: must be an attribute other than the compared one",
     ):
         _vectors(cohort, adjust=["wealth"])
-
-
-def test_describe_traits__colours_that_are_noise():
-    levels = 256
-    quarter = 0.5 / np.sqrt(3 * 256)
-    # 2 squared and 1 squared
-    shift = np.full((3, 1, 3, levels), np.sqrt(5.0) * 2 * quarter)
-    error = np.full((3, 1, 3, levels), 2 * quarter)
-    shift[1] = error[1]
-    error[2] = 0.1 * shift[2]
-    traits = dataset(
-        {
-            "trait_quantile_shift": shift,
-            "trait_quantile_shift_error": error,
-            "trait_count": np.array([[4, 6], [4, 6], [4, 6]]),
-        },
-        coords={
-            "trait": ["a", "b", "c"],
-            "region": ["face"],
-            "side": ["with", "without"],
-        },
-        attrs={"flags": ["a: few"]},
-    )
-    few, noise = describe_traits(traits)
-    assert few == "a: few"
-    assert (
-        noise
-        == "b: with 10 takes, the colour vector cannot be distinguished from noise"
-    )
