@@ -2,8 +2,11 @@
 2005, section 10.2).
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -73,7 +76,18 @@ def register(
         (number of flipped triangles), `reference` and `template`. `mm_per_uv` is the
         scale of the common coordinates, from the distances of the landmarks.
     """
-    return dict(registrations(models, reference=reference, smoothing=smoothing))
+    takes = {take: model for take, model in models.items() if has_landmarks(model)}
+    for take, model in takes.items():
+        honour_consent({**model.attrs, "take": take}, "statistics")
+    outlines = {take: outline(model) for take, model in takes.items()}
+    frame = common_frame(outlines, reference=reference, smoothing=smoothing)
+    if frame is None:
+        return {}
+    template = takes[frame.template]
+    return {
+        take: register_one(take, model, template, frame)
+        for take, model in takes.items()
+    }
 
 
 @dataclass(frozen=True)
@@ -82,10 +96,20 @@ class Outline:
     takes fit into memory.
     """
 
+    names: tuple[str, ...]  # of the landmarks
     landmark: Float64  # (k, 3) mm
     landmark_uv: Float64  # (k, 2)
     area: float  # mm2
     alignable: bool  # whether the surface can be aligned with a template
+
+    def with_names(self, names: Sequence[str]) -> Outline:
+        """The outline with the landmarks of all takes."""
+        return replace(
+            self,
+            names=tuple(names),
+            landmark=_arranged(self.landmark, self.names, names),
+            landmark_uv=_arranged(self.landmark_uv, self.names, names),
+        )
 
 
 @dataclass(frozen=True)
@@ -101,58 +125,16 @@ class Frame:
     smoothing: float | None
 
 
-def registrations(
-    models: Takes, *, reference: str | None = None, smoothing: float | None = None
-) -> Iterator[tuple[str, Dataset]]:
-    """Items of the result of `register`; only the surfaces of the template and one
-    other take are in memory.
-    """
-    takes = with_landmarks(models)
-    for take, model in takes.items():
-        honour_consent({**model.attrs, "take": take}, "statistics")
-    names = landmark_names(takes.values())
-    outlines = {take: outline(model, names) for take, model in takes.items()}
-    frame = common_frame(outlines, names, reference=reference, smoothing=smoothing)
-    if frame is None:
-        return
-    for take, model in takes.items():
-        yield take, register_one(take, model, takes[frame.template], frame)
-
-
-def landmark_names(models: Iterable[DataTree]) -> tuple[str, ...]:
-    """Names of the landmarks of all takes."""
-    return tuple(
-        dict.fromkeys(
-            str(n) for m in models for n in m["mesh"].to_dataset()["landmark"].values
-        )
-    )
-
-
-def outline(model: DataTree, names: Sequence[str]) -> Outline:
+def outline(model: DataTree) -> Outline:
     """Outline of a take, the input of `common_frame`."""
-    sheet = _sheet(model, list(names))
-    return Outline(
-        float64(sheet.landmark),
-        _landmark_uv(sheet),
-        sheet.area(),
-        sheet.alignable(),
-    )
-
-
-def with_names(shape: Outline, labels: Sequence[str], names: Sequence[str]) -> Outline:
-    """An outline with the landmarks `labels`, extended to and sorted by the names of the
-    landmarks of all takes.
-    """
-    landmark = np.full((len(names), 3), np.nan)
-    uv = np.full((len(names), 2), np.nan)
-    rows = [list(names).index(name) for name in labels]
-    landmark[rows], uv[rows] = shape.landmark, shape.landmark_uv
-    return Outline(landmark, uv, shape.area, shape.alignable)
+    names, _ = _landmarks(model)
+    sheet = _sheet(model, names)
+    uv = _landmark_uv(sheet)
+    return Outline(names, float64(sheet.landmark), uv, sheet.area(), sheet.alignable())
 
 
 def common_frame(
     outlines: Mapping[str, Outline],
-    names: Sequence[str],
     *,
     reference: str | None = None,
     smoothing: float | None = None,
@@ -163,8 +145,6 @@ def common_frame(
     ----------
     outlines
         Take -> its `outline`, for takes with landmarks.
-    names
-        Names of the landmarks.
     reference, smoothing
         See `register`.
     """
@@ -178,42 +158,30 @@ def common_frame(
         )
     if not outlines:
         return None
-    landmark_uv = {take: shape.landmark_uv for take, shape in outlines.items()}
-    target = (
-        landmark_uv[reference]
-        if reference
-        else mean_shape(np.stack([*landmark_uv.values()]))
-    )
-    template = reference or _template_take(outlines, target)
-    return Frame(
-        tuple(names), landmark_uv, target, template, reference or MEAN, smoothing
-    )
+    names = tuple(dict.fromkeys(n for shape in outlines.values() for n in shape.names))
+    aligned = {take: shape.with_names(names) for take, shape in outlines.items()}
+    at = {take: shape.landmark_uv for take, shape in aligned.items()}
+    target = at[reference] if reference else mean_shape(np.stack([*at.values()]))
+    template = reference or _template_take(aligned, target)
+    return Frame(names, at, target, template, reference or MEAN, smoothing)
 
 
 def register_one(
     take: str, model: DataTree, template: DataTree, frame: Frame
 ) -> Dataset:
     """Common texture coordinates of one take; see `register`."""
-    names = list(frame.names)
-    landmark_uv = frame.at
-    target = frame.target
-    smoothing = frame.smoothing
-    sheet = _sheet(model, names)
-    warp = fit_warp(landmark_uv[frame.template], target, smoothing=smoothing)
+    sheet = _sheet(model, frame.names)
+    fit = partial(fit_warp, target=frame.target, smoothing=frame.smoothing)
+    warp = fit(frame.at[frame.template])
     if take != frame.template:
-        template_sheet = _sheet(template, names)
+        template_sheet = _sheet(template, frame.names)
         chosen = anchor_vertices(template_sheet)
         weak = (
             corresponding_uv(template_sheet, chosen, sheet),
             apply_warp(warp, template_sheet.uv[chosen]),
         )
-        warp = fit_warp(landmark_uv[take], target, smoothing=smoothing, weak=weak)
-    frame_attrs = {"reference": frame.reference, "template": frame.template}
-    return (
-        _registration_dataset(sheet, landmark_uv[take], target, warp)
-        .assign_coords(landmark=names)
-        .assign_attrs(frame_attrs)
-    )
+        warp = fit(frame.at[take], weak=weak)
+    return _registration_dataset(sheet, take, frame, warp)
 
 
 def _template_take(outlines: Mapping[str, Outline], target: Array) -> str:
@@ -243,19 +211,23 @@ def _template_take(outlines: Mapping[str, Outline], target: Array) -> str:
     return max(visible_area, key=lambda take: np.nan_to_num(visible_area[take]))
 
 
-def with_landmarks(models: Takes) -> dict[str, DataTree]:
-    """The takes that have landmarks and can be registered."""
-    return {take: model for take, model in models.items() if has_landmarks(model)}
-
-
-def _sheet(model: DataTree, names: list[str]) -> Sheet:
+def _sheet(model: DataTree, names: Sequence[str]) -> Sheet:
     """Surface of a take and its landmarks (k, 3); NaN for landmarks that the take lacks."""
-    mesh = model["mesh"].to_dataset()
-    landmark = np.full((len(names), 3), np.nan)
-    landmark[[names.index(str(name)) for name in mesh["landmark"].values]] = (
-        _landmarks_mm(model)
-    )
-    return Sheet.of(*surface_of(model), landmark)
+    own, places = _landmarks(model)
+    return Sheet.of(*surface_of(model), _arranged(places, own, names))
+
+
+def _landmarks(model: DataTree) -> tuple[tuple[str, ...], Float64]:
+    """Names of the landmarks of a take, and their positions (k, 3) [mm]."""
+    points = model["mesh"].to_dataset()[variables.LANDMARK_POSITION]
+    return tuple(map(str, points["landmark"].values)), float64(points.values)
+
+
+def _arranged(values: Array, own: Sequence[str], names: Sequence[str]) -> Float64:
+    """Values (own, c) in the order of `names`; NaN for others."""
+    out = np.full((len(names), values.shape[1]), np.nan)
+    out[[names.index(name) for name in own]] = values
+    return out
 
 
 def _landmark_uv(sheet: Sheet) -> Float64:
@@ -269,10 +241,6 @@ def _landmark_uv(sheet: Sheet) -> Float64:
     out = np.full((len(is_known), 2), np.nan)
     out[is_known] = interpolate(sheet.uv, sheet.faces[face], corner)
     return out
-
-
-def _landmarks_mm(model: DataTree) -> Float64:
-    return float64(model["mesh"].to_dataset()[variables.LANDMARK_POSITION].values)
 
 
 def _mm_per_uv(landmark: Array, target: Array) -> float:
@@ -291,18 +259,16 @@ def _mm_per_uv(landmark: Array, target: Array) -> float:
 
 def has_landmarks(model: DataTree) -> bool:
     """Whether a take has at least one landmark."""
-    if (
-        "mesh" not in model.children
-        or variables.LANDMARK_POSITION not in model["mesh"].data_vars
-    ):
+    mesh = model["mesh"].data_vars if "mesh" in model.children else {}
+    if variables.LANDMARK_POSITION not in mesh:
         return False
-    return bool(finite_rows(_landmarks_mm(model)).any())
+    return bool(finite_rows(_landmarks(model)[1]).any())
 
 
-def _registration_dataset(
-    sheet: Sheet, source: Array, target: Array, warp: Warp
-) -> Dataset:
+def _registration_dataset(sheet: Sheet, take: str, frame: Frame, warp: Warp) -> Dataset:
     """Common coordinates of a take and the quality of its warp."""
+    source = frame.at[take]
+    target = frame.target
     common = apply_warp(warp, sheet.uv).astype(np.float32)
     turned = (signed_areas(common, sheet.faces) < 0) & (
         signed_areas(sheet.uv, sheet.faces) >= 0
@@ -319,7 +285,10 @@ def _registration_dataset(
             variables.LANDMARK_USED: warp.used.astype(np.int8),
             variables.MM_PER_UV: _mm_per_uv(sheet.landmark, target),
         },
+        coords={"landmark": frame.names},
         attrs={
+            "reference": frame.reference,
+            "template": frame.template,
             "warp_kind": warp.kind,
             "warp_smoothing": warp.smoothing,
             "warp_anchors": anchors,

@@ -18,10 +18,8 @@ from skindb.analysis.registration import (
     Outline,
     common_frame,
     has_landmarks,
-    landmark_names,
     outline,
     register_one,
-    with_names,
 )
 from skindb.analysis.summary import (
     SAMPLED,
@@ -315,24 +313,16 @@ def _map_results(
 def _common_frame(
     takes: Sequence[str],
     reference: str | None,
-    outlines_of: Callable[
-        [Sequence[str]], Iterator[tuple[str, tuple[str, ...], Outline]]
-    ],
+    outlines_of: Callable[[Sequence[str]], Iterator[tuple[str, Outline]]],
     report: Progress,
 ) -> Frame:
-    """The common (u, v) of takes, from the outlines and the landmarks of all."""
+    """The common (u, v) of takes, from the outlines of all."""
     outlines: dict[str, Outline] = {}
-    landmarks: dict[str, tuple[str, ...]] = {}
     report("outlines", 0, len(takes))
-    for take, points, shape in outlines_of(takes):
-        landmarks[take] = points
+    for take, shape in outlines_of(takes):
         outlines[take] = shape
         report("outlines", len(outlines), len(takes))
-    names = tuple(dict.fromkeys(name for take in takes for name in landmarks[take]))
-    aligned = {
-        take: with_names(outlines[take], landmarks[take], names) for take in takes
-    }
-    frame = common_frame(aligned, names, reference=reference)
+    frame = common_frame({take: outlines[take] for take in takes}, reference=reference)
     assert frame is not None
     return frame
 
@@ -416,10 +406,10 @@ def registered_datasets(
 
 def _outline(
     db: Database, generations: Mapping[str, int], take: str
-) -> tuple[str, tuple[str, ...], Outline]:
-    model = db.read("model", take, generation=generations[take], groups=SURFACE)
-    points = landmark_names([model])
-    return take, points, outline(model, points)
+) -> tuple[str, Outline]:
+    return take, outline(
+        db.read("model", take, generation=generations[take], groups=SURFACE)
+    )
 
 
 def _register(
@@ -447,11 +437,4 @@ def _has_landmarks(db: Database, record: Record) -> bool:
 # functions that compute what cohorts need
 SUMMARY_METHOD = (tables_of, sample_groups, registered_parts)
 # functions that compute a registration
-REGISTRATION_METHOD = (
-    landmark_names,
-    outline,
-    with_names,
-    common_frame,
-    register_one,
-    registered_parts,
-)
+REGISTRATION_METHOD = (outline, common_frame, register_one, registered_parts)

@@ -35,7 +35,6 @@ from skindb.analysis.registration import (
     describe_registration,
     doubtful_landmarks,
     register,
-    registrations,
     tabulate_registration,
 )
 from skindb.analysis.summary import cohort_of
@@ -93,14 +92,6 @@ def test_register__anchors_help_where_no_landmark_is():
         for r in (unregistered(models), register(few))
     )
     assert np.nanmedian(by_few) < 0.7 * np.nanmedian(own)
-
-
-@pytest.mark.slow
-def test_registrations__come_one_after_the_other():
-    models = sheet_pair()
-    first = next(iter(registrations(models)))
-    assert first[0] == "A"
-    xr.testing.assert_identical(first[1], register(models)["A"])
 
 
 @pytest.mark.slow
