@@ -150,7 +150,7 @@ def dome_record(dome: Dome, sensor: Sensor, start: datetime) -> dict[str, Any]:
             "disc_radius": light.disc_radius,
             "intensity": None,  # determined by the white target
             "axis": light.axis.tolist(),
-            "falloff": 0.0,
+            "falloff": light.falloff,
         }
         | _polariser(light)
         for light in dome.lights

@@ -109,15 +109,15 @@ class Emulated:
         """Do what is due by the clock; returns the events that the device sends."""
         return b""
 
-    def event(self, verb: str, **values: object) -> bytes:
+    def event(self, verb: str, **values: str) -> bytes:
         """The line of an event."""
         self._event = self._event % MAX_NUMBER + 1
-        return Message(
-            EVENT,
-            self._event,
-            verb,
-            {name: str(value) for name, value in values.items()},
-        ).encode()
+        return Message(EVENT, self._event, verb, values).encode()
+
+    def greeting(self) -> dict[str, object]:
+        """Reply to HELLO."""
+        same = {"name": "emulated", "firmware": "1", "protocol": PROTOCOL}
+        return {"kind": self.kind, **same}
 
     def handle(self, verb: str, values: dict[str, str]) -> dict[str, object]:
         """Execute a request, and return the values of the reply; raises `RefusedError`
@@ -207,13 +207,7 @@ class EmulatedDome(Emulated):
     def handle(self, verb: str, values: dict[str, str]) -> dict[str, object]:
         """The verbs of a light controller."""
         if verb == "HELLO":
-            return {
-                "kind": self.kind,
-                "name": "emulated",
-                "firmware": "1",
-                "protocol": PROTOCOL,
-                "lights": ",".join(self.lights),
-            }
+            return self.greeting() | {"lights": ",".join(self.lights)}
         if verb in ("CLEAR", "STEP", "ARM") and self.state == "running":
             raise RefusedError("a sequence is running")
         actions = {
@@ -267,21 +261,16 @@ class EmulatedDome(Emulated):
         shines = 0.0 if step.light == self.faults.dead_light else level
         if not lost:
             self._trigger(step.exposure, wrong | {step.light: shines}, step.on_us / 1e6)
-        measured = self._stuck != self.faults.silently_stuck_light
-        rest = (
-            1.0
-            if (self._stuck and measured) or step.light == self.faults.stuck_light
-            else 0.0
-        )
-        total = (level if step.light != "-" else 0.0) + (
-            1.0 if self._stuck and measured else 0.0
-        )
+        measured = bool(self._stuck) and self._stuck != self.faults.silently_stuck_light
+        rest = measured or step.light == self.faults.stuck_light
+        total = level * (step.light != "-") + measured
         step.measured = {
             "on": step.on_us,
             "off": step.off_us,
             "triggers": int(not lost),
+            "level": f"{total:.3f}",
+            "rest": f"{rest:.3f}",
         }
-        step.measured |= {"level": f"{total:.3f}", "rest": f"{rest:.3f}"}
 
     def _dark(self, step: _Step) -> None:
         if step.light in (self.faults.stuck_light, self.faults.silently_stuck_light):
@@ -408,12 +397,7 @@ class EmulatedProbe(Emulated):
         """The verbs of a probe."""
         now = self.clock.monotonic()
         if verb == "HELLO":
-            return {
-                "kind": self.kind,
-                "name": "emulated",
-                "firmware": "1",
-                "protocol": PROTOCOL,
-            }
+            return self.greeting()
         if verb == "PUMP":
             self.target = float(values["kpa"])
             self._since = now

@@ -6,7 +6,8 @@ and the white target.
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
+from itertools import cycle, product
 from pathlib import Path
 
 import imagecodecs
@@ -65,6 +66,7 @@ class DomeLight:
     axis: Float64  # (3,) unit, the direction it shines along
     intensity: Float64  # (3,) radiance mm2
     disc_radius: float = DISC_RADIUS
+    falloff: float = 0.0
     polariser: str | None = None
 
     @property
@@ -123,11 +125,9 @@ def build_dome(
     )
     if not polarised:
         return dome
+    hands = cycle(("left", "right"))
     return Dome(
-        tuple(
-            replace(camera, polariser=("left", "right")[i % 2])
-            for i, camera in enumerate(dome.cameras)
-        ),
+        tuple(replace(camera, polariser=next(hands)) for camera in dome.cameras),
         tuple(replace(light, polariser="left") for light in dome.lights),
     )
 
@@ -312,14 +312,9 @@ def photograph(
     scene = RayScene(surface.vertices, surface.faces)
     lights = render_lights(dome)
     white = frontal_camera(dome)
-    for exposure in EXPOSURES:
-        for template in (FRAMES, DARK, WHITE):
-            make_private(
-                (
-                    folder / template.format(exposure=exposure, light="l", camera="c")
-                ).parent
-            )
-
+    for exposure, template in product(EXPOSURES, (FRAMES, DARK, WHITE)):
+        file = folder / template.format(exposure=exposure, light="l", camera="c")
+        make_private(file.parent)
     glow = exitances(surface, lights, scene) if subsurface else None
 
     def shoot(
@@ -356,54 +351,44 @@ def photograph(
             step()
 
 
+@dataclass(frozen=True)
 class _FrameWriter:
     """Exposes radiance images with one camera and writes the files."""
 
-    def __init__(
-        self,
-        folder: Path,
-        camera: DomeCamera,
-        sensor: Sensor,
-        pattern: Image,
-        rng: np.random.Generator,
-    ) -> None:
-        self.folder = folder
-        self.camera = camera
-        self.sensor = sensor
-        self.pattern = pattern
-        self.rng = rng
-        # loss of light (h, w, 1) towards the corners, 1 at the principal point
+    folder: Path
+    camera: DomeCamera
+    sensor: Sensor
+    pattern: Image
+    rng: np.random.Generator
+
+    @cached_property
+    def gain(self) -> Image:
+        """Loss of light (h, w, 1) towards the corners, 1 at the principal point."""
+        camera = self.camera
         y, x = np.mgrid[: camera.height, : camera.width] + 0.5
         half = np.hypot(camera.width, camera.height) / 2
         r2 = ((x - camera.K[0, 2]) ** 2 + (y - camera.K[1, 2]) ** 2) / half**2
         a2, a4, a6 = camera.vignette
-        self.gain = np.asarray(1 + r2 * (a2 + r2 * (a4 + r2 * a6)), np.float32)[
-            ..., None
-        ]
+        return np.asarray(1 + r2 * (a2 + r2 * (a4 + r2 * a6)), np.float32)[..., None]
 
     def write(
         self, template: str, light: str, radiance: Image, *, averaged: int = 1
     ) -> None:
+        """Write the exposures of one view."""
         for exposure, seconds in zip(EXPOSURES, SECONDS, strict=True):
             image = radiance * self.gain * np.float32(seconds)
             frame = self.sensor.expose(
                 image, self.pattern, averaged=averaged, rng=self.rng
             )
-            path = template.format(
-                exposure=exposure, light=light, camera=self.camera.name
-            )
-            write_png(self.folder / path, frame)
+            names = {"exposure": exposure, "light": light, "camera": self.camera.name}
+            write_png(self.folder / template.format(**names), frame)
 
 
 def render_lights(dome: Dome) -> Lights:
     """Convert the dome's lights for the renderer."""
-    return Lights(
-        np.array([light.position for light in dome.lights]),
-        np.array([light.intensity for light in dome.lights]),
-        np.array([light.disc_radius for light in dome.lights]),
-        np.array([light.axis for light in dome.lights]),
-        np.zeros(len(dome.lights)),
-    )
+    names = ("position", "intensity", "disc_radius", "axis", "falloff")
+    columns = (np.array([getattr(x, name) for x in dome.lights]) for name in names)
+    return Lights(*columns)
 
 
 def frontal_camera(dome: Dome) -> DomeCamera:

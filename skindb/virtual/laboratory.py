@@ -17,6 +17,7 @@ import numpy as np
 
 from skindb.clock import Clock, SimulatedClock
 from skindb.errors import input_error
+from skindb.format.frames import filled
 from skindb.types import Float64, float64
 from skindb.virtual.devices import (
     GAUGE_FAULTS,
@@ -162,11 +163,7 @@ class Laboratory:
         template = str(self._record.get(key) or "")
         if not template:
             return None
-        name = (
-            template.replace("{camera}", camera)
-            .replace("{exposure}", exposure)
-            .replace("{light}", light)
-        )
+        name = filled(template, camera=camera, exposure=exposure, light=light)
         return self.subject / name
 
     def _required(self, camera: str, exposure: str, light: str) -> Path:
@@ -183,12 +180,8 @@ class Laboratory:
             (self.subject / "contact/probe.json").read_text(encoding="utf-8")
         )
         placements = record.get("placements", {}).get(self.site) or [""]
-        name = (
-            record["frames"]
-            .replace("{site}", self.site)
-            .replace("{exposure}", exposure)
-        )
-        name = name.replace("{placement}", str(placements[0]))
+        names = {"exposure": exposure, "placement": str(placements[0])}
+        name = filled(record["frames"], site=self.site, **names)
         shutil.copyfile(
             self.subject / name, self.watched / "probe" / f"IMG_{number:05d}.png"
         )
@@ -222,24 +215,18 @@ def laboratory_faults(
     """
     kinds = {spec.name: str(spec.type) for spec in fields(DeviceFaults)}
     devices: dict[str, dict[str, Any]] = {"dome": {}, "probe": {}}
-    settings: dict[str, Any] = {}
+    dropped = list[tuple[str, int]]()
     for text in texts:
         name, _, value = text.partition("=")
         device, _, fault = name.rpartition(".")
         try:
-            if device in devices and fault in kinds:
-                devices[device][fault] = _fault_value(
-                    fault, kinds[fault], value, lights
-                )
-            elif fault == "dropped_frame":
+            if name == "dropped_frame":
                 camera, number = value.split(":")
-                if camera not in cameras:
-                    raise ValueError(camera)
-                dropped = settings.get("dropped_frames", ())
-                settings["dropped_frames"] = (*dropped, (camera, _count(number)))
+                dropped.append((_word(camera, cameras), _count(number)))
             else:
-                raise ValueError(name)
-        except ValueError:
+                setting = _fault_value(fault, kinds[fault], value, lights)
+                devices[device][fault] = setting
+        except (ValueError, KeyError):
             names = ", ".join(f"dome.{n}" for n in kinds)
             raise input_error(
                 "--fault",
@@ -250,24 +237,28 @@ def laboratory_faults(
             ) from None
     if not texts:
         return None
-    dome = DeviceFaults(**devices["dome"])
-    return LaboratoryFaults(dome, DeviceFaults(**devices["probe"]), **settings)
+    dome, probe = (DeviceFaults(**settings) for settings in devices.values())
+    return LaboratoryFaults(dome, probe, tuple(dropped))
 
 
 def _fault_value(fault: str, kind: str, value: str, lights: Collection[str]) -> Any:
     """The value of a fault of a device; ValueError if it can never happen."""
     if kind.startswith("tuple"):
-        return tuple(_count(number) for number in value.split(":"))
+        return tuple(map(_count, value.split(":")))
     if kind == "str":
-        if value not in (GAUGE_FAULTS if fault == "gauge" else lights):
-            raise ValueError(value)
-        return value
+        return _word(value, GAUGE_FAULTS if fault == "gauge" else lights)
     if kind == "int":
         return _count(value)
     number = float(value)
     if not 0.0 <= number <= (1.0 if fault in PROBABILITIES else MAX_FAULT):
         raise ValueError(value)
     return number
+
+
+def _word(text: str, words: Collection[str]) -> str:
+    if text not in words:
+        raise ValueError(text)
+    return text
 
 
 def _count(text: str) -> int:

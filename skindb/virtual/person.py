@@ -17,16 +17,6 @@ from skindb.virtual.face import FaceShape
 VISIT_MELANIN = 0.1
 VISIT_BLOOD = 0.4
 ANCESTRIES = ("european", "east_asian", "african", "south_asian")
-# subjects of the paper's table 1, dataset B: ancestries, gender, how many, least and
-# largest age, conditions
-TABLE_1 = (
-    (("european",), "male", 50, 13, 59, ("normal",)),
-    (("european",), "female", 5, 24, 55, ("normal",)),
-    (("european",), "female", 6, 23, 56, ("lotion", "makeup")),
-    (("east_asian", "south_asian"), "male", 20, 22, 74, ("normal",)),
-    (("east_asian", "south_asian"), "female", 4, 22, 65, ("normal",)),
-    (("east_asian", "south_asian"), "female", 2, 24, 30, ("lotion", "makeup")),
-)
 
 
 @dataclass(frozen=True)
@@ -102,16 +92,17 @@ def cohort_people(
     seed
         Random seed for the order, ages, skins and shapes.
     """
-    kinds = [(*kind, i) for kind in TABLE_1 for i in range(kind[2])]
+    groups = _tables()["table_1"]
+    kinds = [(group, i) for group in groups for i in range(group["subjects"])]
     order = np.random.default_rng([seed, 87]).permutation(len(kinds))
     people = []
     for number in range(subjects):
-        ancestries, gender, _, youngest, oldest, worn, i = kinds[
-            order[number % len(kinds)]
-        ]
+        group, i = kinds[order[number % len(kinds)]]
+        ancestries = group["ancestries"]
+        worn = group["conditions"]
         rng = np.random.default_rng([seed, number])
-        male = gender == "male"
-        age = int(rng.integers(youngest, oldest + 1))
+        male = group["gender"] == "male"
+        age = int(rng.integers(group["youngest"], group["oldest"] + 1))
         ancestry = ancestries[i % len(ancestries)]
         # boys have none
         shadow = rng.uniform(0.0, 0.8) * min(max(age - 14, 0) / 6, 1.0) if male else 0.0
@@ -119,7 +110,7 @@ def cohort_people(
         person = Person(
             f"P{number + 1:03d}",
             age,
-            gender,
+            group["gender"],
             ancestry,
             int(rng.integers(2**31)),
             worn[i % len(worn)],
@@ -179,6 +170,8 @@ def face_shape(person: Person) -> FaceShape:
 
 @cache
 def _tables() -> dict[str, Any]:
-    """Subjects of the demo, and the terms of a linear model of the shape of faces."""
+    """Subjects of the demo, groups of the paper's table 1 (dataset B), and the terms of a
+    linear model of the shape of faces.
+    """
     tables: dict[str, Any] = package_json("skindb.virtual", "person.json")
     return tables
