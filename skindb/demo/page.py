@@ -8,20 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
-from skindb.geometry.rays import RayScene
 from skindb.render.image import auto_exposure, encode_srgb, tone_map
 from skindb.render.photographs import Comparison, side_by_side
-from skindb.render.rendering import frontal_camera
-from skindb.render.scene import (
-    Lights,
-    Surface,
-    cameras_from_dome,
-    from_model,
-    lights_from_dome,
-)
-from skindb.render.shading import View, shade_view, trace_view
+from skindb.render.rendering import chosen_camera, radiance_of
+from skindb.render.scene import from_model
+from skindb.render.shading import trace_view
 from skindb.schema import variables
-from skindb.types import Array, Bytes, Mask, lengths, unit
+from skindb.types import Array, Bytes, Mask, unit
 
 Image = Array
 Picture = Bytes
@@ -56,32 +49,15 @@ def draw_portraits(models: Mapping[str, xr.DataTree]) -> Portraits:
     return Portraits(images, min(auto_exposure(image) for image in images.values()))
 
 
-def _frontal(
-    model: xr.DataTree, *, scale: float
-) -> tuple[Surface, View, RayScene, xr.Dataset]:
-    dome = model["dome"].to_dataset().load()
-    surface = from_model(model)
-    scene = RayScene(surface.vertices, surface.faces)
-    camera = cameras_from_dome(dome)[frontal_camera(dome)].scaled(scale)
-    return surface, trace_view(surface, camera, samples=2, scene=scene), scene, dome
-
-
-def _key(dome: xr.Dataset) -> Lights:
-    """Two lights of the dome, one from each side."""
-    place = dome[variables.LIGHT_POSITION].values
-    place = unit(place)
-    directions = np.array(KEY_LIGHTS) / lengths(KEY_LIGHTS)[..., None]
-    return lights_from_dome(dome).select(np.argmax(directions @ place.T, axis=1))
-
-
 def portrait(model: xr.DataTree) -> Image:
-    """Linear radiance (h, w, 3) of the model from the front under two lights."""
-    surface, view, scene, dome = _frontal(model, scale=1.6)
-    return np.asarray(
-        shade_view(view, surface, _key(dome), scene, terms=("diffuse", "surface")).sum(
-            axis=0
-        )
-    )
+    """Linear radiance (h, w, 3) of the model from the front under two lights of the dome,
+    one from each side.
+    """
+    dome = model["dome"].to_dataset().load()
+    towards = unit(dome[variables.LIGHT_POSITION].values)
+    nearest = np.argmax(unit(np.array(KEY_LIGHTS)) @ towards.T, axis=1)
+    names = [str(dome["light"].values[i]) for i in nearest]
+    return radiance_of(model, lights=names, scale=1.6)
 
 
 def map_pictures(
@@ -106,7 +82,9 @@ def map_pictures(
 
 
 def _maps(model: xr.DataTree) -> list[tuple[Picture, Mask, str]]:
-    surface, view, _, _ = _frontal(model, scale=1.2)
+    surface = from_model(model)
+    camera, _ = chosen_camera(model["dome"].to_dataset().load(), None)
+    view = trace_view(surface, camera.scaled(1.2), samples=2)
     shine = surface.model.normal_reflectance(view.interpolate(surface.parameters))
     pictures = [
         ((view.interpolate(surface.normals) + 1) / 2, "normal"),

@@ -188,9 +188,10 @@ def face_record(
         "tableA": tables[0],
         **({"tableB": tables[1]} if len(tables) > 1 else {}),
     }
+    about = _about(model, surface, take, attributes, resampled.shape)
+    about["surroundings"] = _surroundings(environment, about["exposure"])
     return {
-        "about": _about(model, surface, take, attributes, resampled.shape)
-        | {"surroundings": _surroundings(model, environment)},
+        "about": about,
         "arrays": {name: _encode(value) for name, value in arrays.items()},
         "traits": [_trait(trait, values) for trait in traits],
     }
@@ -314,13 +315,9 @@ def _trait(trait: Trait, plain: Mapping[str, Array]) -> dict[str, Any]:
 
 def _tables(tables: Float32) -> list[Half]:
     """Tables (nh, nd, np, k) as arrays (np, nh, nd, 4), one for every four bases."""
-    count = tables.shape[-1]
-    padded = np.zeros(
-        (*tables.shape[:3], MAX_TABLES if count > MAX_TABLES // 2 else MAX_TABLES // 2),
-        np.float32,
-    )
-    padded[..., :count] = np.clip(tables, -60000, 60000)
-    turned = np.ascontiguousarray(padded.transpose(2, 0, 1, 3)).astype(np.float16)
+    missing = -tables.shape[-1] % 4
+    padded = np.pad(np.clip(tables, -60000, 60000), [(0, 0)] * 3 + [(0, missing)])
+    turned = padded.transpose(2, 0, 1, 3).astype(np.float16)
     return [
         np.ascontiguousarray(turned[..., i : i + 4])
         for i in range(0, turned.shape[-1], 4)
@@ -330,21 +327,15 @@ def _tables(tables: Float32) -> list[Half]:
 def _quality(model: xr.DataTree, surface: Surface) -> Array:
     """Confidence and relative standard error of the albedo (n, 2); an unknown error is 0."""
     fitted = model["fitted"].to_dataset()
+    total = variables.DIFFUSE_REFLECTANCE_TOTAL_ERROR
+    name = total if total in fitted else variables.DIFFUSE_REFLECTANCE_ERROR
     error = np.zeros(len(surface.vertices))
-    for name in (
-        variables.DIFFUSE_REFLECTANCE_TOTAL_ERROR,
-        variables.DIFFUSE_REFLECTANCE_ERROR,
-    ):
-        if name in fitted:
-            error = (
-                fitted[name].values / np.maximum(surface.diffuse, MIN_ALBEDO)
-            ).mean(axis=1)
-            break
-    trust = surfel_confidence(with_matt_surfels(fitted))
-    return np.stack(
-        [trust, np.clip(np.nan_to_num(error), 0, 10)],
-        axis=1,
-    )
+    if name in fitted:
+        albedo = np.maximum(surface.diffuse, MIN_ALBEDO)
+        error = np.clip(
+            np.nan_to_num((fitted[name].values / albedo).mean(axis=1)), 0, 10
+        )
+    return np.stack([surfel_confidence(with_matt_surfels(fitted)), error], axis=1)
 
 
 def _about(
@@ -382,27 +373,16 @@ def _about(
     }
 
 
-def _surroundings(
-    model: xr.DataTree, environment: Environment | None
-) -> dict[str, Any]:
-    """Distant lights with the irradiance of one light of the dome in front of the face,
-    in the unit of the dome.
+def _surroundings(environment: Environment | None, exposure: float) -> dict[str, Any]:
+    """Distant lights, scaled such that a white surface that faces the front is white at the
+    exposure of the page.
     """
     lights = distant_lights(environment or overcast_sky())
-    front = (
-        (lights.irradiance * np.maximum(lights.direction[:, 2:], 0)).sum(axis=0).mean()
-    )
-    dome = model["dome"].to_dataset().load()
-    middle = model["fitted"].to_dataset()[variables.SURFEL_POSITION].values.mean(axis=0)
-    distance = float(np.median(lengths(dome[variables.LIGHT_POSITION].values - middle)))
-    unit = (
-        float(np.median(dome[variables.LIGHT_INTENSITY].values, axis=0).mean())
-        / distance**2
-        / max(float(front), 1e-30)
-    )
+    facing = lights.irradiance * np.maximum(lights.direction[:, 2:], 0)
+    front = max(float(facing.sum(axis=0).mean()), 1e-30)
     return {
         "direction": lights.direction.tolist(),
-        "irradiance": (lights.irradiance * unit).tolist(),
+        "irradiance": (lights.irradiance * (np.pi / exposure / front)).tolist(),
     }
 
 
