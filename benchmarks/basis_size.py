@@ -118,7 +118,7 @@ def main(
     for size, noise, seed in ((k, e, s) for k in SIZES for e in NOISES for s in seeds):
         systems, needed, H = planted(size, noise, seed, **shape)
         (lower, upper), error = found_sizes(systems)
-        squares, free, _ = surfel_errors(systems, [H]).sum(axis=0)
+        squares, free = surfel_errors(systems, [H]).sum(axis=0)
         truth = np.sqrt(squares[0] / free[0] / (squares[1] / free[1]))
         counts[needed > MATTERS][judged(size, lower, upper)] += 1
         print(

@@ -107,8 +107,7 @@ def population_basis(
     -------
     Dataset
         `population_mixture`, `take_coefficient`. Attributes: relative error over all
-        surfels, relative error of the starting basis, spread of the errors of the
-        sample over the starts, number of passes and surfels, and metric.
+        surfels, and their number.
 
     Raises
     ------
@@ -145,11 +144,7 @@ def population_basis(
         coords={"dictionary": names, "take": takes},
         attrs={
             "nmf_error": float(errors[-1]),
-            "nmf_start_error": float(errors[0]),
-            "nmf_spread": start.spread,
-            "nmf_passes": len(errors),
             "nmf_surfels": int(sum(part_sums.count for part_sums in sums)),
-            "nmf_metric": "brdf" if in_metric else "coefficient",
             "skipped": skipped_takes(cohort),
         },
     )
@@ -266,8 +261,7 @@ def basis_size_curve(
     Dataset
         `relative_error` with its interval; `smallest_size` and `sufficient_size`, the
         bounds of the smallest size on the plateau (`sufficient_size` is 0 if there is
-        no plateau); `plateau_tolerance`; `dictionary_error`, the relative RMS residual
-        with the whole dictionary. Attribute: `surfels`, their number.
+        no plateau); `plateau_tolerance`. Attribute: `surfels`, their number.
     """
     require_comparable(cohort, "surfels")
     same_dictionary(cohort)
@@ -294,26 +288,22 @@ def basis_size_curve(
         variables.SMALLEST_SIZE: fewest,
         variables.SUFFICIENT_SIZE: upper,
         variables.PLATEAU_TOLERANCE: tolerance,
-        variables.DICTIONARY_ERROR: float(
-            np.sqrt(errors[:, 0, -1].sum() / errors[:, 2, -1].sum())
-        ),
     }
     attrs = {"surfels": len(errors), "skipped": skipped_takes(cohort)}
     return dataset(values, coords={"k": ks}, attrs=attrs)
 
 
 def surfel_errors(systems: Systems, bases: Sequence[Array]) -> Array:
-    """Squared residual, degrees of freedom and squared reflectance (n, 3, sizes + 1);
-    the last is for the dictionary.
+    """Squared residual and degrees of freedom (n, 2, sizes + 1); the last is for the
+    dictionary.
 
     The degrees of freedom are the number of values minus the number of non-zero
     weights, as each fits some noise.
     """
-    out = np.empty((len(systems.square), 3, len(bases) + 1))
+    out = np.empty((len(systems.square), 2, len(bases) + 1))
     for j, basis in enumerate([*bases, None]):
         x, out[:, 0, j] = residuals(systems, basis)
         out[:, 1, j] = np.maximum(systems.count - (x > 0).sum(axis=1), 0)
-        out[:, 2, j] = systems.square
     return out
 
 
@@ -344,7 +334,7 @@ def choose_size(
             [rms[:-1] / rms[-1], rms[:-1] / rms[-2], rms[:-2] / rms[1:-1]]
         )
 
-    low, high = bootstrap_interval(errors[:, :2], statistic, rng=rng, draws=500)
+    low, high = bootstrap_interval(errors, statistic, rng=rng, draws=500)
     error = statistic(errors)[:sizes]
     surely, perhaps = (
         _first_on_plateau(ends[sizes:], sizes, tolerance) for ends in (high, low)
@@ -392,42 +382,32 @@ def tabulate_basis_size(curve: Dataset) -> Table:
 
 def describe_basis_size(curve: Dataset) -> str:
     """Number of bases that are needed by `choose_size`, and the reason, in one or two sentences."""
-    ks = curve["k"].values
-    tolerance = f"{100 * float(curve[variables.PLATEAU_TOLERANCE]):.3g} %"
+    ks = curve["k"].values.tolist()
+    tolerance = float(curve[variables.PLATEAU_TOLERANCE])
     fewest = int(curve[variables.SMALLEST_SIZE])
     sufficient = int(curve[variables.SUFFICIENT_SIZE])
-    largest = int(ks[-1])
-    final_error = float(curve[variables.RELATIVE_ERROR][-1])
-    if not sufficient and final_error > 1 + float(curve[variables.PLATEAU_TOLERANCE]):
-        return (
-            f"At least {fewest} bases: with {largest}, the largest size tried, the error is still "
-            f"{100 * (final_error - 1):.3g} % above that with the whole dictionary. "
-            "Try larger sizes."
-        )
+    excess = float(curve[variables.RELATIVE_ERROR][-1]) - 1
+    largest = f"{ks[-1]}, the largest size tried"
     if not sufficient:
+        reason = f"no size below {largest}, is significantly on a plateau of the error"
+        if excess > tolerance:
+            above = f"{100 * excess:.3g} % above that with the whole dictionary"
+            reason = f"with {largest}, the error is still {above}"
         return (
-            f"At least {fewest} bases: no size below {largest}, the largest one "
-            "tried, is significantly on a plateau "
-            "of the error. Try larger sizes or draw more surfels."
+            f"At least {fewest} bases: {reason}. Try larger sizes or draw more surfels."
         )
-    reason = (
-        f"With {sufficient} the error is significantly within {tolerance} of that with "
-        f"{largest}, the largest size tried, "
-        f"and no further basis reduces it by more than {100 * STEP:.3g} %"
-    )
+    sizes = str(sufficient)
+    others = "smaller sizes are significantly worse" if sufficient > ks[0] else ""
     if fewest < sufficient:
-        open_question = (
-            f"this sample does not show whether {_sizes(fewest, sufficient - 1)} would "
-            "suffice"
-        )
-        return f"{fewest} to {sufficient} bases. {reason}; {open_question}."
-    return f"{sufficient} {'basis' if sufficient == 1 else 'bases'}. {reason}" + (
-        "; smaller sizes are significantly worse." if sufficient > ks[0] else "."
-    )
-
-
-def _sizes(low: int, high: int) -> str:
-    return str(low) if low == high else f"{low} to {high}"
+        sizes = f"{fewest} to {sufficient}"
+        others = "this sample does not show whether fewer would suffice"
+    reasons = [
+        f"With {sufficient} the error is significantly within {100 * tolerance:.3g} % of that "
+        f"with {largest}, and no further basis reduces it by more than {100 * STEP:.3g} %",
+        others,
+    ]
+    noun = "basis" if sizes == "1" else "bases"
+    return f"{sizes} {noun}. {'; '.join(filter(None, reasons))}."
 
 
 def _take_errors(take: Dataset, tables: Array, bases: Sequence[Array]) -> Array:

@@ -137,9 +137,8 @@ def chromophore_axes(
     -------
     Dataset
         `chromophore_axis` (chromophore, channel), 1 in green; `chromophore_offset`, the
-        mean -ln R_d, at which amounts are 0; `chromophore_table_axis`, published
-        absorption, and `chromophore_table_angle` to it; `chromophore_axis_spread` by
-        bootstrap over tiles of maps; `density_variance` of the principal components.
+        mean -ln R_d, at which amounts are 0; `chromophore_table_angle` to published
+        absorption; `chromophore_axis_spread` by bootstrap over tiles of maps.
         Attributes: `axes_origin`, `flags`, `skipped`.
 
     Raises
@@ -176,10 +175,8 @@ def chromophore_axes(
             variables.CHROMOPHORE_OFFSET: np.mean(
                 [sample.mean for sample in samples], axis=0
             ),
-            variables.CHROMOPHORE_TABLE_AXIS: TABLE_AXES,
             variables.CHROMOPHORE_TABLE_ANGLE: _angle(axes, TABLE_AXES),
             variables.CHROMOPHORE_AXIS_SPREAD: spread,
-            variables.DENSITY_VARIANCE: plane.variance,
         },
         coords={"chromophore": CHROMOPHORES, "channel": CHANNELS},
         attrs={
@@ -273,24 +270,21 @@ def chromophore_statistics(
     Returns
     -------
     Dataset
-        `take_chromophore`, `take_chromophore_deviation` (take, region, chromophore),
-        `take_chromophore_residual` (take, region) and `take_chromophore_coverage`. NaN
-        for regions of which less than half was measured.
+        `take_chromophore`, `take_chromophore_deviation` (take, region, chromophore) and
+        `take_chromophore_residual` (take, region). NaN for regions of which less than
+        half was measured.
     """
     drawn = map_regions(landmarks or {}, cohort.sizes["v"])
     masks = np.stack(list(drawn.values()))
     vectors = axes[variables.CHROMOPHORE_AXIS].values
     offset = axes[variables.CHROMOPHORE_OFFSET].values
     rows = each_take(_statistics, cohort, MAPPED, masks, vectors, offset)
-    mean, deviation, residual, covered = (
-        np.stack(column) for column in zip(*rows, strict=True)
-    )
+    mean, deviation, residual = (np.stack(column) for column in zip(*rows, strict=True))
     return dataset(
         {
             variables.TAKE_CHROMOPHORE: mean,
             variables.TAKE_CHROMOPHORE_DEVIATION: deviation,
             variables.TAKE_CHROMOPHORE_RESIDUAL: residual,
-            variables.TAKE_CHROMOPHORE_COVERAGE: covered,
         },
         coords={
             "take": cohort["take"].values.tolist(),
@@ -483,10 +477,8 @@ def _unmixed(density: Array, axes: Array, offset: Array) -> tuple[Array, Array]:
 
 def _statistics(
     maps: Dataset, masks: Mask, axes: Array, offset: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Mean and standard deviation (region, chromophore), RMS residual (region,) and
-    coverage (region,).
-    """
+) -> tuple[Array, Array, Array]:
+    """Mean and standard deviation (region, chromophore), and RMS residual (region,)."""
     density, measured = _density(maps)
     covered = covered_fractions(measured, masks)
     mean, deviation = np.full((2, len(masks), len(CHROMOPHORES)), np.nan)
@@ -499,7 +491,7 @@ def _statistics(
         mean[r] = amounts.mean(axis=0)
         deviation[r] = amounts.std(axis=0)
         residuals[r] = np.sqrt(np.mean(residual**2))
-    return mean, deviation, residuals, covered
+    return mean, deviation, residuals
 
 
 def _angle(a: Array, b: Array) -> Array:

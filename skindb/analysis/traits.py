@@ -415,10 +415,6 @@ class Parameters:
     """Parameters of the study of traits."""
 
     k: int = option(6, "Number of components of the common basis.", minimum=1)
-    in_metric: bool = option(
-        False,
-        "Find the common basis in the metric of BRDFs instead of that of coefficients.",
-    )
     adjust: tuple[str, ...] = adjust_option()
     seed: int = seed_option("the factorisation and the bootstrap")
     dictionary: Path | None = option(None, DICTIONARY_HELP)
@@ -431,7 +427,6 @@ def compute(population: Population, parameters: Parameters) -> Results:
         population.cohort,
         tables=population.brdf_tables(),
         k=parameters.k,
-        in_metric=parameters.in_metric,
         rng=rng,
     )
     colours = albedo_and_texture(population)

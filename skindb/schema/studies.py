@@ -160,10 +160,6 @@ PLATEAU_TOLERANCE = declare(
     "float64 basis_size/plateau_tolerance() [1]",
     "relative error above the plateau that still counts as on it",
 )
-DICTIONARY_ERROR = declare(
-    "float64 basis_size/dictionary_error() [1]",
-    "relative RMS residual of reflectance with the whole dictionary",
-)
 
 # population_basis
 POPULATION_MIXTURE = declare(
@@ -520,11 +516,6 @@ CHROMOPHORE_OFFSET = declare(
     "float64 chromophores/chromophore_offset(channel) [1]",
     "mean -ln R_d over takes, where amounts are 0",
 )
-CHROMOPHORE_TABLE_AXIS = declare(
-    "float64 chromophores/chromophore_table_axis(chromophore, channel) [1]",
-    "absorption of the pigment in solution, over that at green",
-    "Prahl 1999; Sarna and Swartz 1988",
-)
 CHROMOPHORE_TABLE_ANGLE = declare(
     "float64 chromophores/chromophore_table_angle(chromophore) [deg]",
     "angle between the axis and the table's",
@@ -532,10 +523,6 @@ CHROMOPHORE_TABLE_ANGLE = declare(
 CHROMOPHORE_AXIS_SPREAD = declare(
     "float64 chromophores/chromophore_axis_spread(chromophore) [deg]",
     "RMS angle by which independent components turn in bootstrapped samples of texels",
-)
-DENSITY_VARIANCE = declare(
-    "float64 chromophores/density_variance(axis) [1]",
-    "variance of -ln R_d along its principal components",
 )
 TAKE_CHROMOPHORE = declare(
     "float64 chromophores/take_chromophore(take, region, chromophore) [1]",
@@ -549,10 +536,6 @@ TAKE_CHROMOPHORE_DEVIATION = declare(
 TAKE_CHROMOPHORE_RESIDUAL = declare(
     "float64 chromophores/take_chromophore_residual(take, region) [1]",
     "RMS of ln R_d that no pigment explains",
-)
-TAKE_CHROMOPHORE_COVERAGE = declare(
-    "float64 chromophores/take_chromophore_coverage(take, region) [1]",
-    "fraction of the region that is measured",
 )
 
 # chromophore_maps

@@ -128,7 +128,6 @@ def _studies(takes: tuple[str, ...]) -> dict[str, xr.DataTree]:
         "smallest_size": 3,
         "sufficient_size": 4,
         "plateau_tolerance": 0.01,
-        "dictionary_error": 0.02,
     }
     albedo = {
         "histogram_edge": (("axis", "edge"), np.tile(np.linspace(-2, 2, 257), (3, 1))),

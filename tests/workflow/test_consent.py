@@ -184,7 +184,6 @@ def test_analyze_command__refuses_options_of_other_studies(db):
     for option in (
         ("--k", "3"),
         ("--seed", "1"),
-        ("--in-metric",),
         ("--permutations", "200"),
     ):
         result = CliRunner().invoke(
