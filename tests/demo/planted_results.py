@@ -168,6 +168,7 @@ def _studies(takes: tuple[str, ...]) -> dict[str, xr.DataTree]:
                 traits,
                 where
                 | {"trait": ["ancestry:south_asian"], "side": ["with", "without"]},
+                {"flags": []},
             )
         },
     }
