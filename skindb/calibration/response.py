@@ -207,7 +207,9 @@ def _equations(
     value = np.where(samples.usable, value, 0.5)
     hat = np.where(value < 0.5, value, np.maximum(1 - value, MIN_BRIGHT_WEIGHT))
     weight = np.where(samples.usable, hat, 0.0) ** 2
-    design = _knot_weights(value)
+    # of linear interpolation between the knots
+    position = _place(value)[..., None] * (KNOTS - 1)
+    design = np.maximum(1 - np.abs(position - np.arange(KNOTS)), 0)
     target = np.log(samples.seconds) - np.log(value)
     # subtracting the weighted mean eliminates the unknown radiance of a sample
     total = weight.sum(axis=1, keepdims=True)
@@ -249,12 +251,6 @@ def _cross_validated(samples: ResponseSamples, value: Float64) -> float:
         square = np.einsum("fi,fij,fj->", fits, normals, fits)
         scores.append(square - 2 * (fits * moments).sum())
     return float(SMOOTHNESS[np.argmin(scores)])
-
-
-def _knot_weights(value: Float64) -> Float64:
-    """Weights (sample, exposure, knot) of linear interpolation between the knots."""
-    position = _place(value)[..., None] * (KNOTS - 1)
-    return np.asarray(np.maximum(1 - np.abs(position - np.arange(KNOTS)), 0))
 
 
 @dataclass(frozen=True)

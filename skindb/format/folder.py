@@ -522,7 +522,12 @@ class _Reader:
                 if not len(vertices):
                     self.skipped.append(f"region {name}: it has no vertices")
         if surface is not None and not (self.sized or self.unit_faults):
-            self._check_size(fields.where, _middles(scan, regions))
+            middles = {
+                name: scan.vertices[ids].mean(axis=0)
+                for name, ids in regions.items()
+                if len(ids)
+            }
+            self._check_size(fields.where, middles)
         return regions
 
     def _dome(self, surface: CleanMesh | None) -> DomeRecord | None:
@@ -581,15 +586,6 @@ class _Reader:
                         "list its vertices, or remove the region",
                     )
                 )
-
-
-def _middles(scan: Scan, regions: Mapping[str, Index]) -> dict[str, Point]:
-    """Centres of the regions."""
-    return {
-        name: scan.vertices[ids].mean(axis=0)
-        for name, ids in regions.items()
-        if len(ids)
-    }
 
 
 def _vertices(fields: Fields, name: str, count: int) -> Index | None:

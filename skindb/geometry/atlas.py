@@ -176,14 +176,6 @@ def _circle(path: Array) -> Float64:
     return DISC_RADIUS * np.stack([np.cos(angle), -np.sin(angle)], axis=1)
 
 
-def _matrix(n: int, *entries: tuple[Index, Index, Array]) -> sp.csr_matrix:
-    """Sparse matrix (n, n) of rows, columns and values."""
-    rows, columns, values = (
-        np.concatenate(parts) for parts in zip(*entries, strict=True)
-    )
-    return sp.csr_matrix((values, (rows, columns)), shape=(n, n))
-
-
 def _mean_value_weights(points: Array, faces: Index) -> sp.csr_matrix:
     """Row i: (tan(a/2) + tan(b/2)) / |p_j - p_i| of both angles at i beside edge ij
     (Floater 2003, eq. 2.1).
@@ -201,8 +193,9 @@ def _mean_value_weights(points: Array, faces: Index) -> sp.csr_matrix:
         # at least 1e-6 and at most 1e6, so that coinciding or opposite sides have
         # positive, finite weights
         half = np.sqrt(np.clip(1 - cosine, 1e-12, 2) / np.clip(1 + cosine, 1e-12, 2))
-        beside = _matrix(n, (here, after, half / a), (here, before, half / b))
-        weights = weights + beside
+        sides = (np.tile(here, 2), np.concatenate([after, before]))
+        beside = np.concatenate([half / a, half / b])
+        weights = weights + sp.csr_matrix((beside, sides), shape=(n, n))
     return weights
 
 
@@ -279,13 +272,8 @@ def flipped(uv: Array, faces: Faces) -> Mask:
     """Mask (f,) of the triangles that are turned over in the map, v downwards, or so thin that
     rounding hides it.
     """
-    wrong = np.empty(len(faces), bool)
-    for start in range(0, len(faces), TRIANGLES_PER_BLOCK):
-        part = faces[start : start + TRIANGLES_PER_BLOCK]
-        plus, minus = _area_products(uv[part])
-        error = CERTAIN * (np.abs(plus) + np.abs(minus))
-        wrong[start : start + TRIANGLES_PER_BLOCK] = plus - minus <= error
-    return wrong
+    plus, minus = _area_products(uv[faces])
+    return np.asarray(plus - minus <= CERTAIN * (np.abs(plus) + np.abs(minus)))
 
 
 def stretches(

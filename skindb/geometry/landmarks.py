@@ -126,9 +126,9 @@ def _onto(shape: Array, target: Array) -> Float64:
 def _mean_of_complete(shapes: Array) -> Float64:
     """Mean (k, 2) over the shapes that have a point."""
     complete = np.isfinite(shapes).all(axis=2, keepdims=True)
-    total = np.where(complete, shapes, 0.0).sum(axis=0)
-    count = complete.sum(axis=0)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    total = shapes.sum(axis=0, where=complete)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(total / complete.sum(axis=0))
 
 
 def mate(name: str) -> str:

@@ -165,7 +165,7 @@ def fit_warp(
     centre = a
     goal = b
     if weak is not None:
-        weak_source, weak_target = _finite(*weak)
+        weak_source, weak_target = np.stack(weak)[:, finite_rows(np.hstack(weak))]
         centre = np.concatenate([a, (weak_source - origin) / scale])
         goal = np.concatenate([b, weak_target])
     is_weak = np.arange(len(centre)) >= len(a)
@@ -273,12 +273,6 @@ def _merged(source: Array, target: Array) -> tuple[Float64, Float64, Mask]:
 def _spread(points: Array) -> float:
     """Root mean square distance from the centroid; 0 for coinciding points or none."""
     return float(np.sqrt(points.var(axis=0).sum())) if len(points) else 0.0
-
-
-def _finite(source: Array, target: Array) -> tuple[Float64, Float64]:
-    """Points that are finite in both."""
-    finite = finite_rows(np.hstack([source, target]))
-    return float64(source)[finite], float64(target)[finite]
 
 
 def _plain(
@@ -410,8 +404,9 @@ def _aligned(
     n = len(clicks)
     # the landmarks first, then the chosen points
     points = np.concatenate([clicks @ matrix + shift, start])
-    distances = lengths(points[:, None] - points)
-    kernel = DEFORMATION_SD_MM**2 * _matern(distances / DEFORMATION_LENGTH_MM)
+    # covariance of a once differentiable field (Matern)
+    r = np.sqrt(3) * lengths(points[:, None] - points) / DEFORMATION_LENGTH_MM
+    kernel = DEFORMATION_SD_MM**2 * (1 + r) * np.exp(-r)
     pull = np.concatenate([take.landmark[shared] - points[:n], np.zeros_like(start)])
     error = np.tile(CLICK_SD_MM**2 * np.eye(3), (len(points), 1, 1))
     is_used = np.arange(len(points)) < n
@@ -449,9 +444,3 @@ def _weights(kernel: Array, pull: Array, error: Array) -> Float64:
     system[np.arange(m), :, np.arange(m)] += error
     weights = np.linalg.solve(system.reshape(3 * m, 3 * m), pull.ravel())
     return weights.reshape(m, 3)
-
-
-def _matern(distance: Array) -> Float64:
-    """Covariance of a once differentiable field, over its length."""
-    r = np.sqrt(3) * distance
-    return np.asarray((1 + r) * np.exp(-r))

@@ -1,7 +1,7 @@
 """Cameras that write files, and the assignment of their frames to triggers."""
 
 import os
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -147,7 +147,10 @@ class FolderCameras:
             if enough or now > end or now > changed + self._quiet:
                 break
             self._clock.sleep(LOOK_SECONDS)
-        return {name: _in_order(shots.values()) for name, shots in complete.items()}
+        return {
+            name: sorted(shots.values(), key=lambda shot: (shot.time, shot.path))
+            for name, shots in complete.items()
+        }
 
     def _files(
         self, name: str, complete: Collection[Path] = ()
@@ -164,10 +167,6 @@ class FolderCameras:
         except OSError as error:
             raise InputError(system_fault(error, f"camera {name}")) from None
         return files
-
-
-def _in_order(shots: Iterable[Shot]) -> list[Shot]:
-    return sorted(shots, key=lambda shot: (shot.time, shot.path))
 
 
 def match_frames(shots: Sequence[Shot], triggers: Sequence[float]) -> list[Path | None]:

@@ -458,7 +458,9 @@ def write_capture(
         "sequence": session.sequence,
         "dark": dark if has_dark else None,
     }
-    _copy_white(setup, out)
+    # every capture has its own frames of the white target
+    for file in setup.dome.frame_files("white"):
+        _copy(file, out / file.relative_to(setup.folder))
     _dump(out / "dome/dome.json", dome)
     if session.sites and setup.probe is not None:
         _write_probe(session, setup.probe)
@@ -509,12 +511,6 @@ def _write_probe(session: Unfinished, probe: Mapping[str, Any]) -> None:
         },
     }
     _dump(session.folder / "contact/probe.json", record)
-
-
-def _copy_white(setup: Setup, out: Path) -> None:
-    """Copy the frames of the white target from the set-up, so that every capture has its own."""
-    for file in setup.dome.frame_files("white"):
-        _copy(file, out / file.relative_to(setup.folder))
 
 
 def _copy(path: Path, target: Path) -> None:

@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from typing import Protocol, TextIO, TypeVar
 from urllib.parse import quote, unquote
@@ -302,8 +302,7 @@ class Link:
         line = Message(REQUEST, self._number, verb, texts).encode()
         for _ in range(ATTEMPTS):
             self._write(line)
-            reply = self._wait()
-            if reply is not None:
+            if (reply := self._wait()) is not None:
                 return self._require_ok(verb, reply)
         seconds = ATTEMPTS * REPLY_SECONDS
         noise = ""
@@ -467,11 +466,7 @@ class Link:
 def _new_file(path: Path) -> Path:
     """The path, with a number added if it exists, so that logs of earlier sessions are kept."""
     numbered = (path.with_stem(f"{path.stem}-{i}") for i in count(2))
-    return (
-        path
-        if not path.exists()
-        else next(candidate for candidate in numbered if not candidate.exists())
-    )
+    return next(file for file in chain([path], numbered) if not file.exists())
 
 
 def open_port(url: str) -> Port:

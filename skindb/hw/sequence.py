@@ -55,9 +55,11 @@ class Schedule:
         """CRC-32 over the lines of the steps, by which the controller identifies the
         plan that it holds.
         """
-        return (
-            f"{binascii.crc32(''.join(map(step_line, self.steps)).encode('ascii')):08X}"
+        lines = "".join(
+            f"{step.light} {step.exposure} {step.on_us} {step.off_us}\n"
+            for step in self.steps
         )
+        return f"{binascii.crc32(lines.encode('ascii')):08X}"
 
     def subset(self, steps: Iterable[int]) -> Schedule:
         """Schedule of some of the steps, starting at zero, each followed by the same
@@ -88,11 +90,6 @@ class Measured:
     level: float  # current of the light while it was on, relative to its nominal one
     # current of all lights after it was switched off, relative to one light
     rest: float
-
-
-def step_line(step: Step) -> str:
-    """Line of a step in the digest of a plan."""
-    return f"{step.light} {step.exposure} {step.on_us} {step.off_us}\n"
 
 
 def plan_schedule(
@@ -199,12 +196,7 @@ class Override:
     @property
     def complete(self) -> bool:
         """Whether a named operator confirmed all of it."""
-        return (
-            bool(self.operator)
-            and self.screened
-            and self.consented
-            and self.eyes_closed
-        )
+        return all((self.operator, self.screened, self.consented, self.eyes_closed))
 
     def recorded(self, assessment: Assessment) -> dict[str, Any]:
         """Record that is stored with the capture."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from skindb.errors import input_error
-from skindb.geometry.mesh import vertex_areas
+from skindb.geometry.mesh import face_crosses, vertex_areas
 from skindb.geometry.rays import RayScene
 from skindb.optics.dipole_tree import subsurface_exitance
 from skindb.optics.fresnel import circular_reversal, fresnel_transmittance
@@ -84,19 +84,10 @@ def received_light(
     hidden = scene.occluded(points[front], place[front], normal=normals[front])
     lit = front[~hidden]
     out = np.zeros(len(points))
-    out[lit] = entering_light(lights, i, towards[lit], square[lit], cosine[lit], eta)
+    along = np.maximum(-(towards[lit] @ lights.axis[i]) / np.sqrt(square[lit]), 0)
+    passed = fresnel_transmittance(np.minimum(cosine[lit], 1), eta)
+    out[lit] = cosine[lit] / square[lit] * along ** float(lights.falloff[i]) * passed
     return out
-
-
-def entering_light(
-    lights: Lights, i: int, towards: Array, square: Array, cosine: Array, eta: float
-) -> Array:
-    """Irradiance (n,) under the boundary per radiant intensity of light i [mm-2], without
-    shadows, from vectors (n, 3) to the light, their squares, and cosines to the normals.
-    """
-    along = np.maximum(-(towards @ lights.axis[i]) / np.sqrt(square), 0)
-    passed = fresnel_transmittance(np.minimum(cosine, 1), eta)
-    return np.asarray(cosine / square * along ** float(lights.falloff[i]) * passed)
 
 
 def exitances(
@@ -327,9 +318,8 @@ def _facing_points(
         normal = unit(normal)
         towards = camera.centre - position
         towards = unit(towards)
-        facing = (dots(normal, towards) > 0) & (
-            _facet_cosine(surface, corners, towards) > 0
-        )
+        facet = face_crosses(surface.vertices, corners)
+        facing = (dots(normal, towards) > 0) & (dots(facet, towards) > 0)
     return position, normal, towards, facing
 
 
@@ -427,11 +417,6 @@ def polariser_factor(
     towards = unit(towards)
     cosine = lengths(towards + view.towards) / 2  # of theta_d
     return view.image(1 - polarisation * circular_reversal(cosine, eta)[:, None])
-
-
-def _facet_cosine(surface: Surface, corners: Index, towards: Array) -> Array:
-    a, b, c = (surface.vertices[corners[:, i]] for i in range(3))
-    return dots(np.cross(b - a, c - a), towards)
 
 
 def _lamp_points(lights: Lights, i: int, total: int) -> Array:

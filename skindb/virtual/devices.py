@@ -247,7 +247,11 @@ class EmulatedDome(Emulated):
                 self._light(step)
             if now < step.off_us or self._done == self.faults.frozen_at:
                 break
-            self._dark(step)
+            stuck = (self.faults.stuck_light, self.faults.silently_stuck_light)
+            if step.light in stuck:
+                self._stuck = step.light
+            self.on = self._stuck or None
+            self._done += 1
         if self.state == "running" and self._done == len(self.steps):
             self.state = "done"
         return b""
@@ -271,12 +275,6 @@ class EmulatedDome(Emulated):
             "level": f"{total:.3f}",
             "rest": f"{rest:.3f}",
         }
-
-    def _dark(self, step: _Step) -> None:
-        if step.light in (self.faults.stuck_light, self.faults.silently_stuck_light):
-            self._stuck = step.light
-        self.on = self._stuck or None
-        self._done = self._done + 1
 
     def _clear(self, _: dict[str, str]) -> dict[str, object]:
         self.steps = []

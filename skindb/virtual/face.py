@@ -339,9 +339,11 @@ def region_membership(points: Float64, shape: FaceShape) -> dict[str, Float64]:
     eyelid = eyelid * _soft(z - 60, 8)
     oval = 1 - np.hypot((y + 14) / 38, (z - 72) / 52)
     cheek = _soft(oval, 0.2) * _soft(x - 19 - 0.22 * np.maximum(-8 - y, 0), 5)
-    brow = _soft(3.6 - np.abs(y - _brow_height(x, s)), 2.2)
+    height = 58.0 + 2.0 * s.brow - 0.012 * (x - 34) ** 2
+    brow = _soft(3.6 - np.abs(y - height), 2.2)
     lower = _soft(-12 - y + 0.35 * np.maximum(x - 40, 0), 7) * _soft(y + 100, 10)
-    hairless = _hairless_cheek(x, y, s.mouth_height)
+    # the centre of the cheeks and below the outer sides of the nose, where no beard grows
+    hairless = _soft(16 - np.hypot((x - 36) * 0.8, y - s.mouth_height - 16), 6)
     fields = {
         "forehead": _soft(y - 66, 6) * _soft(66 - x, 10) * _soft(z - 20, 12),
         "nose": nose,
@@ -370,13 +372,6 @@ def _nose_region(x: Float64, y: Float64, z: Float64, s: FaceShape) -> Float64:
     )
 
 
-def _hairless_cheek(x: Float64, y: Float64, mouth: float) -> Float64:
-    """1 in the centre of the cheeks and below the outer sides of the nose, where no
-    beard grows.
-    """
-    return _soft(16 - np.hypot((x - 36) * 0.8, (y - mouth - 16) * 1.0), 6)
-
-
 def _lips(x: Float64, y: Float64, z: Float64, s: FaceShape) -> Float64:
     """The red of the lips: between two arcs that meet in the corners."""
     line = s.mouth_height + mouth_line(x)
@@ -394,10 +389,6 @@ def _lips(x: Float64, y: Float64, z: Float64, s: FaceShape) -> Float64:
         * _soft(taper - 0.08, 0.08)
         * _soft(z - 70, 8)
     )
-
-
-def _brow_height(x: Float64, s: FaceShape) -> Float64:
-    return 58.0 + 2.0 * s.brow - 0.012 * (x - 34) ** 2
 
 
 def _lashes(points: Float64, shape: FaceShape) -> Float64:
