@@ -180,18 +180,6 @@ def make_private(folder: Path, mode: int = PRIVATE) -> None:
             parent.chmod(mode)
 
 
-def write_private(path: Path, content: bytes) -> None:
-    """Write a file that only its owner can read, whatever the umask; an existing file
-    is replaced.
-    """
-    path.unlink(missing_ok=True)
-    number = os.open(
-        path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, PRIVATE_FILE
-    )
-    with os.fdopen(number, "wb") as file:
-        file.write(content)
-
-
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 # first characters of formulas, also in full width
 FORMULA = frozenset("=+-@\t\r\n\uff1d\uff0b\uff0d\uff20")

@@ -12,8 +12,7 @@ withdrawals that were applied.
 import hashlib
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import TypeVar
@@ -22,7 +21,7 @@ from skindb.errors import Fault, InputError, input_error, require
 from skindb.store.bucket import place_at
 from skindb.store.erasure import remainder_of
 from skindb.store.lease import Lease
-from skindb.store.log import UPDATE, tombstone_content, tombstone_of
+from skindb.store.log import tombstone_content, tombstone_of
 from skindb.store.markers import (
     BACKUP,
     ENTRY,
@@ -33,7 +32,14 @@ from skindb.store.markers import (
     require_secret,
     withdrawn_hashes,
 )
-from skindb.store.place import KIND, TAKE, TIME_HEX, Place, UnavailableError
+from skindb.store.place import (
+    KIND,
+    TAKE,
+    TIME_HEX,
+    Place,
+    UnavailableError,
+    in_parallel,
+)
 from skindb.store.record import (
     DIGEST,
     Record,
@@ -41,6 +47,7 @@ from skindb.store.record import (
     damage_as_fault,
     reason_of,
     record_from_json,
+    require_format,
     seal_of,
     sealed_object,
 )
@@ -190,11 +197,7 @@ class Archive:
             )
         with damage_as_fault(self.place.where(key), AS_WRITTEN, CURE_STATE):
             body = sealed_object(self.place.read_small(key))
-            format_ = body.pop("format")
-            if format_ != FORMAT:
-                raise ValueError(
-                    f"a state of format {format_!r}; if it is later, {UPDATE}"
-                )
+            require_format("state", body.pop("format"), FORMAT)
             if body["number"] != number:
                 raise ValueError("another state")
             if not all(
@@ -436,7 +439,7 @@ def other_files(
 
 def intact(
     function: Callable[[T], R], values: Iterable[T], faults: list[Fault]
-) -> Iterator[tuple[T, R]]:
+) -> list[tuple[T, R]]:
     """Values and the results of a function that waits for files; where it fails, its
     faults are added to `faults`.
     """
@@ -446,12 +449,11 @@ def intact(
         return collect_faults(partial(function, value), damage), damage
 
     values = list(values)
-    pool = ThreadPoolExecutor(THREADS)
-    try:
-        for value, outcome in zip(values, pool.map(attempt, values), strict=True):
-            result, damage = outcome
-            faults.extend(damage)
-            if result is not None:
-                yield value, result
-    finally:
-        pool.shutdown(cancel_futures=True)
+    read = []
+    for value, (result, damage) in zip(
+        values, in_parallel(attempt, values, THREADS), strict=True
+    ):
+        faults += damage
+        if result is not None:
+            read.append((value, result))
+    return read

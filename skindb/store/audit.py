@@ -12,10 +12,10 @@ import json
 import re
 import uuid
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from functools import partial
-from typing import Any
+from typing import Any, get_origin
 
 from skindb import __version__
 from skindb.errors import Fault, InputError, input_error
@@ -27,7 +27,12 @@ from skindb.store.place import (
     in_parallel,
     subject_of,
 )
-from skindb.store.record import collect_faults, damage_as_fault, json_object
+from skindb.store.record import (
+    collect_faults,
+    damage_as_fault,
+    json_object,
+    require_format,
+)
 
 FORMAT = 1
 BLOCK = 1_000  # numbers in a folder
@@ -56,21 +61,6 @@ class AuditEntry:
     # read
     previous: str
     seal: str = field(compare=False)
-
-
-TYPES = {
-    "number": int,
-    "id": str,
-    "when": str,
-    "actor": str,
-    "action": str,
-    "subjects": list,
-    "counts": dict,
-    "parameters": dict,
-    "software_version": str,
-    "previous": str,
-    "seal": str,
-}
 
 
 def append_entry(
@@ -242,12 +232,11 @@ def _outcome(place: Place, secret: bytes, number: int) -> AuditEntry | Fault:
                 raise ValueError(f"the entry of number {str(body.get('number'))[:20]}")
             if not is_sealed(secret, key, body):
                 raise ValueError("content that does not match its seal")
-            if body.pop("format", None) != FORMAT:
-                raise ValueError(
-                    "an entry of another format; if it is of a later version, update skindb"
-                )
-            if body.keys() != TYPES.keys() or not all(
-                isinstance(body[name], kind) for name, kind in TYPES.items()
+            require_format("log entry", body.pop("format", None), FORMAT)
+            types = {spec.name: spec.type for spec in fields(AuditEntry)}
+            if body.keys() != types.keys() or not all(
+                isinstance(body[name], get_origin(kind) or kind)
+                for name, kind in types.items()
             ):
                 raise ValueError("fields that do not match its format")
             return AuditEntry(**body)

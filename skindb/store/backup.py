@@ -138,8 +138,7 @@ def verify_archive(archive: Archive) -> list[Fault]:
             if item[1] not in checked
         }
         checked |= fresh.keys()
-        for _ in intact(lambda item: bool(archive.read(item)), fresh.values(), faults):
-            pass
+        intact(lambda item: bool(archive.read(item)), fresh.values(), faults)
     return list(dict.fromkeys(faults))
 
 

@@ -22,7 +22,7 @@ from skindb.store.entries import catalogue_blocks_of
 from skindb.store.folder import remove_tree
 from skindb.store.gathered import blocks_of
 from skindb.store.lease import Lease
-from skindb.store.log import Log, committed_logs, takes_below
+from skindb.store.log import Log, committed_logs, remove_version, takes_below
 from skindb.store.markers import Markers, mark_withdrawn, note_withdrawals, read_markers
 from skindb.store.place import (
     KINDS_OF_ONE_SUBJECT,
@@ -37,7 +37,7 @@ from skindb.store.place import (
     subject_of,
 )
 from skindb.store.record import Record, subjects_of
-from skindb.store.stage import read_names, remove_version
+from skindb.store.stage import read_names
 from skindb.store.stale import (
     PINS,
     TAKES,

@@ -15,7 +15,7 @@ from skindb.schema.consent import CONSENT
 from skindb.store.erasure import SCRATCH_NAME, erase_withdrawn, holdings_of
 from skindb.store.gathered import GATHERED, unneeded_blocks
 from skindb.store.lease import NUMBER, Lease, abandoned_holder, holder_of, storage_time
-from skindb.store.log import Log, committed_logs, takes_below
+from skindb.store.log import Log, committed_logs, remove_version, takes_below
 from skindb.store.markers import Markers, read_markers
 from skindb.store.place import (
     CALIBRATION,
@@ -25,7 +25,6 @@ from skindb.store.place import (
     Place,
 )
 from skindb.store.record import Key, Record
-from skindb.store.stage import remove_version
 from skindb.store.verify import may_have_had_record
 
 STILL_WRITING_SECONDS = 3600.0  # newer files may belong to a run without a lease

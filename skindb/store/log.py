@@ -11,7 +11,7 @@ missing or outdated, but if it is intact and ahead of the log, a record was lost
 import hashlib
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -22,20 +22,18 @@ from skindb.store.markers import WithdrawnError
 from skindb.store.place import (
     KIND,
     TAKE,
+    VERSION,
     Guard,
     Place,
-    UnavailableError,
     require_text,
 )
 from skindb.store.record import (
-    DAMAGE,
     FORMAT,
-    LaterError,
     Record,
     collect_faults,
+    damage_as_fault,
     intact_or_none,
     json_object,
-    reason_of,
     record_from_json,
     record_to_json,
     seal_of,
@@ -44,7 +42,6 @@ from skindb.store.record import (
 GENERATION = re.compile(r"([0-9]{8})\.json")
 HEADS = "heads"
 RESTORE = "restore it from a backup"
-UPDATE = "update skindb"
 
 
 class Conflict(InputError):  # noqa: N818  an event, not an error of the program
@@ -75,7 +72,7 @@ class Log:
         # read before the log, which only grows
         head = self.head() if generation is None else {}
         listed = self.generations()
-        if generation is None and (lost := self._lost_fault(head, listed)):
+        if lost := self._head_faults(head, listed):
             raise InputError(lost)
         if not listed or (generation is not None and generation not in listed):
             rule = (
@@ -88,13 +85,13 @@ class Log:
                 f"{self.place.name}: {self.what}", rule, finding, "see skindb info"
             )
         record = self._read(listed[-1] if generation is None else generation)
-        if fault := self._mismatch_fault(head, record):
-            raise InputError(fault)
+        if exchanged := self._head_faults(head, listed, [record]):
+            raise InputError(exchanged)
         return record
 
     def is_empty(self) -> bool:
         """Whether no record was ever committed, or all records were removed deliberately."""
-        return not self.generations() and not self._lost_fault(
+        return not self.generations() and not self._head_faults(
             self.head(), self.generations()
         )
 
@@ -146,14 +143,8 @@ class Log:
         """
         record = self._read(generation)
         self.place.create(tombstone_of(record.seal), tombstone_content(record))
-        for key in (
-            record.path,
-            record.beside("tables"),
-            record.beside("manifest"),
-            record.beside("names"),
-            self.record_key(generation),
-        ):
-            self.place.remove(key)
+        remove_version(self.place, record.path)
+        self.place.remove(self.record_key(generation))
 
     def faults(self) -> tuple[list[Record], list[Fault]]:
         """The readable records, and the faults of the other records, of the chain of
@@ -171,12 +162,10 @@ class Log:
                 seal = "?"
             else:
                 faults += self._link_faults(record, preceding, seal)
-                faults += filter(None, [self._mismatch_fault(head, record)])
                 records.append(record)
                 seal = record.seal
             preceding = generation
-        faults += filter(None, [self._lost_fault(head, listed)])
-        return records, faults
+        return records, faults + self._head_faults(head, listed, records)
 
     def readable(self) -> list[Record]:
         """All readable records, oldest first; damaged ones are skipped."""
@@ -222,67 +211,41 @@ class Log:
             missing = missing - 1
             tombstone = self._tombstone(before)
         if missing:
-            lost = (
-                f"generation {preceding + 1}"
-                if missing == 1
-                else f"generations {preceding + 1} to {preceding + missing}"
-            )
-            return [
-                Fault(
-                    self.what,
-                    f"{lost} must exist",
-                    "no record and no tombstone",
-                    RESTORE,
+            rule = f"generation {preceding + 1} must exist"
+            if missing > 1:
+                rule = (
+                    f"generations {preceding + 1} to {preceding + missing} must exist"
                 )
-            ]
-        if seal not in ("?", before):
-            return [
-                Fault(
-                    self.what,
-                    f"generation {record.generation} must follow the record before it",
-                    "a record that names a different predecessor",
-                    RESTORE,
-                )
-            ]
-        return []
+            finding = "no record and no tombstone"
+        elif seal not in ("?", before):
+            rule = f"generation {record.generation} must follow the record before it"
+            finding = "a record that names a different predecessor"
+        else:
+            return []
+        return [Fault(self.what, rule, finding, RESTORE)]
 
-    def _lost_fault(self, head: dict[str, Any], listed: list[int]) -> Fault | None:
-        """Fault if the head, a cache that may be outdated, is ahead of the log: then
-        records were lost.
+    def _head_faults(
+        self, head: dict[str, Any], listed: list[int], records: Iterable[Record] = ()
+    ) -> list[Fault]:
+        """Faults if the head, a cache that may be outdated, is ahead of the log, because
+        records were lost, or names another record of the same generation.
         """
-        if (
-            not head
-            or (listed and head["generation"] <= listed[-1])
-            or self.is_removed(head["seal"])
-        ):
-            return None
-        finding = f"generations {listed}" if listed else "nothing"
-        return Fault(
-            self.what,
-            f"generation {head['generation']} must exist",
-            finding,
-            self._head_cure(),
-        )
-
-    def _mismatch_fault(self, head: dict[str, Any], record: Record) -> Fault | None:
-        """Fault if a record is not the one that the head names for its generation."""
-        if (
-            not head
-            or head["generation"] != record.generation
-            or head["seal"] == record.seal
-        ):
-            return None
+        if not head:
+            return []
+        number = head["generation"]
+        seals = {record.generation: record.seal for record in records}
+        if number > max(listed, default=0):
+            rule = f"generation {number} must exist"
+            finding = f"generations {listed}" if listed else "nothing"
+        elif seals.get(number, head["seal"]) != head["seal"]:
+            rule = f"generation {number} must be the record that was committed"
+            finding = "a different record"
+        else:
+            return []
         if self.is_removed(head["seal"]):
-            return None
-        return Fault(
-            self.what,
-            f"generation {record.generation} must be the record that was committed",
-            "a different record",
-            self._head_cure(),
-        )
-
-    def _head_cure(self) -> str:
-        return f"{RESTORE}; if the log is correct, remove {self.head_key}"
+            return []
+        cure = f"{RESTORE}; if the log is correct, remove {self.head_key}"
+        return [Fault(self.what, rule, finding, cure)]
 
     def _write_head(
         self, generation: int, seal: str, guard: Guard | None = None
@@ -329,20 +292,17 @@ class Log:
 
 def read_record(place: Place, key: str) -> tuple[Record, str]:
     """The record in a file of the log, and the digest of the file."""
-    try:
+    rule = "a record of the log must be as committed"
+    with damage_as_fault(place.where(key), rule, RESTORE):
         content = place.read_small(key)
         return record_from_json(content, key), hashlib.sha256(content).hexdigest()
-    except UnavailableError:
-        raise
-    except DAMAGE as error:
-        finding = reason_of(error)
-        cure = RESTORE
-        if isinstance(error, LaterError):
-            finding += ", written by a later version of skindb"
-            cure = UPDATE
-    raise input_error(
-        place.where(key), "a record of the log must be as committed", finding, cure
-    )
+
+
+def remove_version(place: Place, path: str) -> None:
+    """Remove the data of a version, which no record names any more when this call ends."""
+    require_text(path, VERSION, "path of a version")
+    for ending in (".zarr", ".tables.json", ".manifest.json", ".names.json"):
+        place.remove(path.removesuffix(".zarr") + ending)
 
 
 def tombstone_of(seal: str) -> str:

@@ -51,7 +51,7 @@ from skindb.errors import (
     input_error,
     system_fault,
 )
-from skindb.files import make_private, read_regular, write_private
+from skindb.files import make_private, private_file, read_regular
 from skindb.limits import MAX_STORE_JSON_BYTES
 from skindb.schema.consent import consent_scope
 from skindb.store.folder import flush_path
@@ -377,7 +377,7 @@ def _locked(folder: Path) -> Iterator[None]:
 def _write(file: Path, content: bytes) -> None:
     """Write or replace a file durably, everything or nothing."""
     temporary = file.with_name(f".{file.name}.tmp")
-    write_private(temporary, content)
+    private_file(temporary).write_bytes(content)
     flush_path(temporary)
     temporary.rename(file)  # which replaces it
     flush_path(file.parent)

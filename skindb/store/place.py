@@ -75,14 +75,14 @@ def block_digests(content: bytes | bytearray) -> list[str]:
     ]
 
 
-def in_parallel(function: Callable[[T], R], values: Iterable[T]) -> list[R]:
-    """Results of a function that reads small files, in the order of the values."""
-    pool = ThreadPoolExecutor(READER_THREADS)
-    try:
+def in_parallel(
+    function: Callable[[T], R], values: Iterable[T], threads: int = READER_THREADS
+) -> list[R]:
+    """Results of a function that reads files, in the order of the values."""
+    with ThreadPoolExecutor(threads) as pool:
+        # an error cancels the calls that wait: if a bucket does not answer one request,
+        # it does not answer the others
         return list(pool.map(function, values))
-    finally:
-        # if a bucket does not answer one request, it does not answer the others
-        pool.shutdown(cancel_futures=True)
 
 
 def subject_of(take: str) -> str:

@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from typing import Any, TypeGuard, TypeVar
+from typing import Any, TypeVar
 
 from skindb.errors import Fault, InputError, input_error
 from skindb.files import json_depth
@@ -109,10 +109,6 @@ def collect_faults(read: Callable[[], T], faults: list[Fault]) -> T | None:
         return None
 
 
-class LaterError(ValueError):
-    """The record was written by a later version of skindb."""
-
-
 @dataclass(frozen=True)
 class Record:
     """One commit."""
@@ -171,12 +167,7 @@ class Record:
 
     def as_input(self) -> dict[str, Any]:
         """Reference to this version in the provenance of another one."""
-        return {
-            "kind": self.kind,
-            "take": self.take,
-            "generation": self.generation,
-            "seal": self.seal,
-        }
+        return {name: getattr(self, name) for name in INPUT}
 
 
 def inputs_in(provenance: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -210,16 +201,12 @@ def record_from_json(content: bytes, key: str) -> Record:
 
     Raises
     ------
-    LaterError
-        If it was written by a later version of skindb.
     ValueError
-        If the file is not as it was committed, or is the record of another version.
+        If the file is not as it was committed, is the record of another version, or was
+        written by another release of skindb.
     """
     body = json_object(content)
-    format_ = body.get("format")
-    if format_ != FORMAT:
-        later = _is_count(format_) and format_ > FORMAT
-        raise (LaterError if later else ValueError)(f"a record of format {format_!r}")
+    require_format("record", body.get("format"), FORMAT)
     seal = body.pop("seal", None)
     if seal != seal_of(body):
         raise ValueError("content that does not match its seal")
@@ -228,11 +215,9 @@ def record_from_json(content: bytes, key: str) -> Record:
             f"fields that do not match its format: {', '.join(sorted(body))[:200]}"
         )
     provenance = body["provenance"]
-    version = provenance.get("schema_version") if isinstance(provenance, dict) else None
-    if _is_count(version) and version != SCHEMA_VERSION:
-        raise (LaterError if version > SCHEMA_VERSION else ValueError)(
-            f"schema version {version}"
-        )
+    # before the variables, which another schema may not have
+    if isinstance(provenance, dict) and "schema_version" in provenance:
+        require_format("schema", provenance["schema_version"], SCHEMA_VERSION)
     if wrong := [name for name, form in FIELDS.items() if not _fits(body[name], form)]:
         raise ValueError(f"invalid values of {', '.join(wrong)}")
     if not {"schema_version", "software_version"} <= provenance.keys():
@@ -248,7 +233,15 @@ def record_from_json(content: bytes, key: str) -> Record:
     return Record(**body, seal=seal)
 
 
-def _is_count(value: object) -> TypeGuard[int]:
+def require_format(what: str, found: object, expected: int) -> None:
+    """Raise a `ValueError` if a file is of another format than this release writes."""
+    if found != expected:
+        raise ValueError(
+            f"a {what} of format {found!r}; update skindb if that is a later one"
+        )
+
+
+def _is_count(value: object) -> bool:
     return (
         isinstance(value, int)
         and not isinstance(value, bool)
@@ -312,7 +305,6 @@ INPUT: dict[str, Shape] = {
 }
 # parts of a provenance that skindb reads without opening the version
 PROVENANCE: dict[str, Shape] = {
-    "schema_version": _is_count,
     "software_version": TEXT,
     # a capture names files
     "inputs": lambda value: isinstance(value, dict) or _fits(value, [_is_input]),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from bisect import insort
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -173,14 +173,9 @@ class Lookup:
     def takes(self, kind: str) -> frozenset[str]:
         """Takes with a version of this kind."""
         if kind not in self._takes:
+            names = self._source.takes(kind)
             if self._is_pinned(kind):
-                names = [
-                    take
-                    for pinned_kind, take in self._pins or ()
-                    if pinned_kind == kind
-                ]
-            else:
-                names = self._source.takes(kind)
+                names = [take for pinned, take in self._pins or () if pinned == kind]
             self._takes[kind] = frozenset(names)
         return self._takes[kind]
 
@@ -247,7 +242,7 @@ def list_records(place: Place, kind: str = "") -> dict[Key, str]:
         listed_kind, take, file, *_ = [*path.split("/"), "", ""]
         match = GENERATION.fullmatch(file)
         if match and re.fullmatch(KIND, listed_kind) and re.fullmatch(TAKE, take):
-            identities[listed_kind, take, int(match[1])] = identity_text(identity)
+            identities[listed_kind, take, int(match[1])] = str(identity)
         elif re.fullmatch(KIND, listed_kind) and take.endswith(".json"):
             raise input_error(
                 place.where(f"log/{path}"),
@@ -256,11 +251,6 @@ def list_records(place: Place, kind: str = "") -> dict[Key, str]:
                 "move it back, or restore the folders log and heads from a backup",
             )
     return identities
-
-
-def identity_text(identity: tuple[Hashable, ...]) -> str:
-    """Identity of a file as text; empty if there is none."""
-    return str(identity) if identity else ""
 
 
 def consent_of(records: Records, take: str) -> tuple[str, ...]:
@@ -392,15 +382,11 @@ class RecordCache:
         Errors of single records are ignored here; they are raised when the record is requested.
         """
         chosen = {*kinds}
-        newest = [(*key, None) for key in self._generations if key[0] in chosen]
-        missing = [
-            key
-            for key in [
-                *newest,
-                *((*key, generation) for key, generation in pins.items()),
-            ]
-            if self._entry(*key) is None
+        keys: list[tuple[str, str, int | None]] = [
+            (*key, None) for key in self._generations if key[0] in chosen
         ]
+        keys += [(*key, generation) for key, generation in pins.items()]
+        missing = [key for key in keys if self._entry(*key) is None]
         in_parallel(intact_or_none, [partial(self._read, *key) for key in missing])
 
     def save(self) -> None:
@@ -466,12 +452,9 @@ def _list_heads(place: Place) -> dict[tuple[str, str], str]:
     """Identity of every head, by kind and take; empty if the folder of heads is damaged."""
     # a link in place of the folder is damage
     identities = intact_or_none(partial(place.identities, "heads")) or {}
-    parts = {
-        name: name.removesuffix(".json").partition("/")
-        for name in identities
-        if name.endswith(".json")
-    }
-    return {
-        (kind, take): identity_text(identities[name])
-        for name, (kind, _, take) in parts.items()
-    }
+    heads = {}
+    for name, identity in identities.items():
+        if name.endswith(".json"):
+            kind, _, take = name.removesuffix(".json").partition("/")
+            heads[kind, take] = str(identity)
+    return heads

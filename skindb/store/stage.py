@@ -30,13 +30,12 @@ from skindb.store.inputs import (
     require_own_subject,
 )
 from skindb.store.lease import Lease
-from skindb.store.log import Log
+from skindb.store.log import Log, remove_version
 from skindb.store.markers import WithdrawalGuard, read_markers, require_secret
 from skindb.store.place import (
     GROUP,
     KINDS_OF_ONE_SUBJECT,
     TAKE,
-    VERSION,
     Place,
     UnavailableError,
     in_parallel,
@@ -355,13 +354,6 @@ def read_names(place: Place, path: str) -> list[str] | None:
         return [require_text(name, TAKE, "take") for name in names]
 
     return intact_or_none(read)
-
-
-def remove_version(place: Place, path: str) -> None:
-    """Remove the data of a version that no record names."""
-    require_text(path, VERSION, "path of a version")
-    for ending in (".zarr", f".{TABLES}.json", ".manifest.json", f".{NAMES}.json"):
-        place.remove(path.removesuffix(".zarr") + ending)
 
 
 def describe(ds: xr.Dataset) -> dict[str, Any]:

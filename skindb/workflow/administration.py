@@ -17,7 +17,7 @@ from typing import Any
 import skindb
 from skindb import __version__, store
 from skindb.errors import Fault, InputError, few_names
-from skindb.files import write_private
+from skindb.files import private_file
 from skindb.store import (
     CALIBRATION,
     RELEASE,
@@ -366,7 +366,7 @@ def write_erasure_report(withdrawal: Withdrawal, path: Path) -> Path:
     """Write a report as JSON, under a path without or with the ending .json."""
     file = path.with_name(f"{path.name.removesuffix('.json')}.json")
     content = json.dumps(erasure_report(withdrawal), indent=1)
-    write_private(file, f"{content}\n".encode())
+    private_file(file).write_text(f"{content}\n", encoding="utf-8")
     return file
 
 

@@ -245,7 +245,7 @@ def test_marker_file__that_cannot_be_written_is_a_warning(db, tmp_path, monkeypa
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(markers, "write_private", full)
+    monkeypatch.setattr(markers, "private_file", full)
     with pytest.warns(
         MarkerFileWarning, match="found No space left on device; free some space there"
     ):

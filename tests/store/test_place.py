@@ -14,8 +14,8 @@ from stored import commit
 from skindb.errors import InputError
 from skindb.store import Database
 from skindb.store.folder import Folder
+from skindb.store.log import remove_version
 from skindb.store.place import inside
-from skindb.store.stage import remove_version
 
 OUTSIDE = [
     "..",

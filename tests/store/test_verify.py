@@ -184,7 +184,7 @@ def _nested(depth):
         ),
         (
             lambda body: body["provenance"].update(schema_version=9),
-            "schema version 9, written by a later version of skindb; upd",
+            "a schema of format 9; update skindb if that is a later one",
         ),
         (
             lambda body: body["provenance"].update(inputs=[1]),
@@ -208,9 +208,9 @@ def _nested(depth):
         ),
         (
             lambda body: body.update(format=9),
-            "a record of format 9, written by a later version of skindb; update skindb",
+            "a record of format 9; update skindb if that is a later one",
         ),
-        (lambda body: body.update(format=True), "a record of format True; restore"),
+        (lambda body: body.update(format=True), "a record of format True; update"),
         (lambda body: body.update(bytes="1"), "invalid values of bytes"),
         (lambda body: body.update(generation=2.0), "invalid values of generation"),
         (lambda body: body.update(contents=[]), "invalid values of contents"),
