@@ -10,7 +10,7 @@ import math
 import os
 import re
 import stat
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import resources
@@ -21,6 +21,8 @@ from typing import Any
 
 from skindb.errors import InputError, input_error
 
+Json = dict[str, Any]  # a JSON object
+Attributes = Mapping[str, Any]  # by their names; only read
 ROOT = Path(__file__).parent
 PRIVATE = 0o700  # permissions of folders with personal data
 PRIVATE_FILE = 0o600  # and of files

@@ -35,6 +35,7 @@ from skindb.cli.shared import (
 )
 from skindb.cli.terminal import bar, echo
 from skindb.errors import Fault, InputError
+from skindb.files import Json
 from skindb.parameters import FitParameters
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def fit(
     refit: bool,
     explain: bool,
     wait: float,
-    changes: dict[str, Any],
+    changes: Json,
 ) -> None:
     """Fit the named takes, or all without a current model.
 
@@ -101,7 +102,7 @@ def fit(
         progress=progress,
     )
     finish = partial(_finished, database)
-    results: dict[str, Any] = {}
+    results: Json = {}
     faults: list[Fault] = []
     if chosen:
         if not (asked("scheduler") or explain):
@@ -121,9 +122,7 @@ def fit(
     emit(results, [], faults)
 
 
-def _report_kept(
-    database: Database, takes: Sequence[str], changes: dict[str, Any]
-) -> None:
+def _report_kept(database: Database, takes: Sequence[str], changes: Json) -> None:
     """One line for each take whose fit keeps parameters that are not the defaults."""
     for take in takes:
         with suppress(InputError):  # the fit of the take reports it
@@ -163,7 +162,7 @@ def _finished(
     return result.take, report, lines
 
 
-def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
+def _fit_lines(take: str, report: Json) -> list[str]:
     total = sum(report["seconds"].values())
     status = ", ".join(
         f"{fraction:.1%} {name}" for name, fraction in report["status"].items()
@@ -217,7 +216,7 @@ def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _energy_lines(energy: dict[str, Any]) -> list[str]:
+def _energy_lines(energy: Json) -> list[str]:
     """A line if the highlights reflect more than the prior of the surface allows."""
     if not energy.get("contradicted"):
         return []
@@ -229,7 +228,7 @@ def _energy_lines(energy: dict[str, Any]) -> list[str]:
     ]
 
 
-def _site_line(site: str, result: dict[str, Any]) -> str:
+def _site_line(site: str, result: Json) -> str:
     """sigma_tr of one site with its total error, by channel, and the status of the fit."""
     values = zip("RGB", result["sigma_tr"], result["total_error"], strict=True)
     channels = ", ".join(
@@ -240,7 +239,7 @@ def _site_line(site: str, result: dict[str, Any]) -> str:
     return f"  sigma_tr of {site}: {channels} mm-1 ({statuses})"
 
 
-def _suspect_line(suspect: dict[str, Any]) -> str:
+def _suspect_line(suspect: Json) -> str:
     device, question = (
         ("light", "did the face move?")
         if "light" in suspect

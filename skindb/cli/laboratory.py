@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -11,6 +11,7 @@ import skindb
 from skindb.cli.options import DB, PATH, PORT, command, options_of
 from skindb.cli.shared import emit, existing, serve, writable
 from skindb.cli.terminal import bar, wait_for_enter
+from skindb.files import Json
 from skindb.parameters import CalibrationParameters, SessionParameters
 
 if TYPE_CHECKING:
@@ -139,7 +140,7 @@ def calibrate(
     emit(summary | report, lines)
 
 
-def _rig_lines(record: Record, report: dict[str, Any]) -> list[str]:
+def _rig_lines(record: Record, report: Json) -> list[str]:
     """What a calibration from takes found, one line each."""
     misfit = report["misfit"]
     lines = [
@@ -173,7 +174,7 @@ def _rig_lines(record: Record, report: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _calibration_lines(record: Record, report: dict[str, Any]) -> list[str]:
+def _calibration_lines(record: Record, report: Json) -> list[str]:
     """What a calibration found, one line each."""
     lines = [
         f"{record.take}: calibration {record.generation} of {report['lights']} lights, "
@@ -204,7 +205,7 @@ def _calibration_lines(record: Record, report: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _camera_lines(calibrated: dict[str, Any]) -> list[str]:
+def _camera_lines(calibrated: Json) -> list[str]:
     """Results of the calibration of the cameras, one line each."""
     words = {
         "dark frames": "at most {defect_pixels:.0f} hot or noisy pixels",

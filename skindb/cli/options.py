@@ -14,6 +14,7 @@ import click
 from click.core import ParameterSource
 
 import skindb
+from skindb.files import Json
 from skindb.limits import MAX_SEED, MAX_WAIT_S, MAX_WORKERS
 from skindb.parameters import DICTIONARY_HELP, Option, broken_rule, option_of, words_of
 
@@ -145,7 +146,7 @@ def _click_option(
     if unset and default is not False:
         default_text = f"{default:g}" if isinstance(default, float) else default
         text += f"  [default: {default_text}]"
-    settings: dict[str, Any] = {"default": None if unset else default, "help": text}
+    settings: Json = {"default": None if unset else default, "help": text}
     if default is MISSING:
         settings = {"required": True, "help": text}
     if limits.metavar:
@@ -158,7 +159,7 @@ def _click_option(
     )
 
 
-def _kind(hint: Any, limits: Option, default: Any) -> dict[str, Any]:
+def _kind(hint: Any, limits: Option, default: Any) -> Json:
     """Settings of an option that follow from the type of its field."""
     if words_of(hint) and limits.minimum is not None:
         return {"type": WordOrNumber(hint, limits)}

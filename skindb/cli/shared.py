@@ -22,7 +22,7 @@ import skindb
 from skindb.cli.options import asked
 from skindb.cli.terminal import Progress, echo
 from skindb.errors import Fault, InputError, few_names, input_error, require
-from skindb.files import plain
+from skindb.files import Json, plain
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -128,7 +128,7 @@ def each_take(
     shared: Path | None = None,
     progress: Progress,
     finish: Callable[[R], tuple[str, Any, list[str]]],
-) -> tuple[dict[str, Any], list[Fault]]:
+) -> tuple[Json, list[Fault]]:
     """Call a function for every take and print each result when it is available; a
     fault does not stop other takes.
 
@@ -142,7 +142,7 @@ def each_take(
         Called in this process with each result; returns its name, what --json prints of
         it, and lines to print.
     """
-    results: dict[str, Any] = {}
+    results: Json = {}
     faults: list[Fault] = []
     workers = asked("workers") or 1
     # so that the running take is known
@@ -283,7 +283,7 @@ def require_folder(path: Path) -> None:
     )
 
 
-def summary_of(record: Record) -> dict[str, Any]:
+def summary_of(record: Record) -> Json:
     """The parts of the record of a version that commands print."""
     names = ("skipped", "cleaning", "cleaning_places", "summary", "registration")
     parts = {

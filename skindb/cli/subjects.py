@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -22,6 +22,7 @@ from skindb.cli.options import (
 from skindb.cli.shared import cluster, emit, existing, require_folder, shared_path
 from skindb.cli.terminal import bar, confirm, echo
 from skindb.errors import few_names, input_error
+from skindb.files import Json
 
 if TYPE_CHECKING:
     from skindb.store import Database
@@ -109,7 +110,7 @@ def release(
     emit(listed, lines or ["no releases"])
 
 
-def _released(database: Database, name: str) -> dict[str, Any]:
+def _released(database: Database, name: str) -> Json:
     record = database.record("release", name)
     takes: dict[str, dict[str, int]] = {}
     for source in record.made_from:
@@ -164,7 +165,7 @@ def refresh(
     )
 
 
-def stale_as_json(result: Refreshed) -> dict[str, Any]:
+def stale_as_json(result: Refreshed) -> Json:
     """JSON record of a stale version and its replacement."""
     return {
         "kind": result.kind,
@@ -294,7 +295,7 @@ def _plan_lines(plan: Withdrawal) -> list[str]:
     ]
 
 
-def _withdrawal_as_json(withdrawal: Withdrawal) -> dict[str, Any]:
+def _withdrawal_as_json(withdrawal: Withdrawal) -> Json:
     return {
         "versions": list(withdrawal.versions),
         "users": list(withdrawal.users),

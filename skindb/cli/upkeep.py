@@ -22,6 +22,7 @@ from skindb.cli.shared import (
 )
 from skindb.cli.subjects import stale_as_json
 from skindb.errors import InputError, input_error
+from skindb.files import Json
 
 if TYPE_CHECKING:
     from skindb.store import BackupReport, Database, Garbage, Restored
@@ -75,9 +76,7 @@ def info(db: str, where: str | None, release: str | None) -> None:
     emit(result, lines or ["The database holds no takes."])
 
 
-def _info_lines(
-    database: Database, result: dict[str, Any], *, details: bool
-) -> list[str]:
+def _info_lines(database: Database, result: Json, *, details: bool) -> list[str]:
     """One line for each take and kind, and the details of each."""
     lines = []
     parts = [
@@ -411,5 +410,5 @@ def _restored_lines(restored: Restored, without_markers: bool) -> list[str]:
     return lines
 
 
-def _as_json(report: BackupReport | Restored) -> dict[str, Any]:
+def _as_json(report: BackupReport | Restored) -> Json:
     return {name: value for name, value in asdict(report).items() if name != "faults"}

@@ -12,10 +12,10 @@ import json
 import re
 import uuid
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
-from typing import Any, get_origin
+from typing import Any, get_origin, get_type_hints
 
 from skindb import __version__
 from skindb.errors import Fault, InputError, input_error
@@ -233,7 +233,7 @@ def _outcome(place: Place, secret: bytes, number: int) -> AuditEntry | Fault:
             if not is_sealed(secret, key, body):
                 raise ValueError("content that does not match its seal")
             require_format("log entry", body.pop("format", None), FORMAT)
-            types = {spec.name: spec.type for spec in fields(AuditEntry)}
+            types = get_type_hints(AuditEntry)
             if body.keys() != types.keys() or not all(
                 isinstance(body[name], get_origin(kind) or kind)
                 for name, kind in types.items()

@@ -2,11 +2,11 @@
 
 import warnings
 from collections.abc import Iterable
-from typing import Any
 
 import pandas as pd
 
 from skindb.errors import InputError, SkindbWarning, few_names
+from skindb.files import Json
 from skindb.schema.cohort import column, imitates_column, take_coords
 from skindb.schema.consent import CONSENT, consent_scope
 from skindb.store.condition import evaluate, is_missing
@@ -91,7 +91,7 @@ def matching(frame: pd.DataFrame, where: str) -> list[str]:
     return [take for take, is_true in zip(takes, truth, strict=True) if is_true]
 
 
-def _row(lookup: Lookup, take: str) -> dict[str, Any]:
+def _row(lookup: Lookup, take: str) -> Json:
     records = {
         kind: lookup.record(kind, take)
         for kind in CATALOGUE_KINDS
@@ -128,9 +128,9 @@ def cached_table(lookup: Lookup) -> pd.DataFrame:
 
 def describe_versions(
     db: Located, *, takes: Iterable[str] | None, where: str | None, release: str | None
-) -> dict[str, Any]:
+) -> Json:
     """See `Database.info`."""
-    sections: dict[str, dict[str, Any]] = {
+    sections: dict[str, Json] = {
         name: {} for name in ("takes", *INFO_SECTIONS.values())
     }
     cache = RecordCache(db.place)
@@ -159,7 +159,7 @@ def describe_versions(
     }
 
 
-def _describe(lookup: Lookup, stale: Staleness, kind: str, take: str) -> dict[str, Any]:
+def _describe(lookup: Lookup, stale: Staleness, kind: str, take: str) -> Json:
     try:
         record = lookup.record(kind, take)
         reasons = stale.reasons(record) if kind in DERIVED else ()

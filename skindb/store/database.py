@@ -11,7 +11,7 @@ import pandas as pd
 import xarray as xr
 
 from skindb.errors import Fault, InputError, input_error, require
-from skindb.files import make_private
+from skindb.files import Json, make_private
 from skindb.schema.consent import CONSENT, require_consent
 from skindb.store.archive import Archive
 from skindb.store.arrays import open_version
@@ -306,7 +306,7 @@ class Database:
         """
         return record_consent(self.place, subject, scope)
 
-    def consent_history(self, subject: str) -> list[dict[str, Any]]:
+    def consent_history(self, subject: str) -> list[Json]:
         """History of the consent of a subject, oldest first: created, scope and source
         (a capture or a record).
         """
@@ -535,7 +535,7 @@ class Database:
         """Whether data of a withdrawn subject are left, which `complete_erasures` removes."""
         return bool(holdings_of(self.place, self.markers()))
 
-    def withdrawal(self, subject: str) -> dict[str, Any] | None:
+    def withdrawal(self, subject: str) -> Json | None:
         """When a subject was withdrawn, and the numbers of removed versions; None if the
         subject is not withdrawn.
         """
@@ -555,7 +555,7 @@ class Database:
         takes: Sequence[str] | None = None,
         where: str | None = None,
         release: str | None = None,
-    ) -> dict[str, Any]:
+    ) -> Json:
         """Summary of the database, {"takes": {take: {kind: {generation, path, created,
         bytes, status}}}}.
 

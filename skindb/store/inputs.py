@@ -4,11 +4,11 @@ covered by consent.
 A subject may be withdrawn, or change the consent, while the version is computed.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from functools import partial
-from typing import Any
 
 from skindb.errors import Fault, InputError, input_error
+from skindb.files import Attributes
 from skindb.schema.consent import CONSENT, consent_scope
 from skindb.store.log import Log
 from skindb.store.place import (
@@ -34,7 +34,7 @@ REQUIRED_SCOPES = {
 }
 
 
-def require_inputs(place: Place, provenance: Mapping[str, Any]) -> list[Record]:
+def require_inputs(place: Place, provenance: Attributes) -> list[Record]:
     """The records of the inputs of a version.
 
     Raises
@@ -66,7 +66,7 @@ def require_inputs(place: Place, provenance: Mapping[str, Any]) -> list[Record]:
 
 
 def names_of(
-    kind: str, take: str, provenance: Mapping[str, Any], inputs: Iterable[Record]
+    kind: str, take: str, provenance: Attributes, inputs: Iterable[Record]
 ) -> set[str]:
     """The other takes that a version refers to, directly or through its inputs.
 
@@ -101,7 +101,7 @@ def require_own_subject(kind: str, take: str, names: Iterable[str]) -> None:
 
 
 def require_consents(
-    place: Place, kind: str, take: str, provenance: Mapping[str, Any]
+    place: Place, kind: str, take: str, provenance: Attributes
 ) -> None:
     """Raise an `InputError` if the present consent of a subject does not cover the version."""
     scope = REQUIRED_SCOPES.get(kind)
@@ -133,7 +133,7 @@ def require_consents(
         raise InputError(faults)
 
 
-def _record_of(place: Place, reference: Mapping[str, Any]) -> Record | None:
+def _record_of(place: Place, reference: Attributes) -> Record | None:
     """The record of an input; None if it was removed or replaced."""
     log = Log(place, reference["kind"], reference["take"])
     record = intact_or_none(partial(log.read, reference["generation"]))
@@ -141,5 +141,5 @@ def _record_of(place: Place, reference: Mapping[str, Any]) -> Record | None:
     return record if is_same else None
 
 
-def _name(reference: Mapping[str, Any]) -> str:
+def _name(reference: Attributes) -> str:
     return f"{reference['kind']} {reference['generation']} of {reference['take']}"

@@ -17,16 +17,16 @@ import socket
 import threading
 import time
 import uuid
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 from skindb.clock import SYSTEM_CLOCK, Clock
 from skindb.errors import Fault, InputError
+from skindb.files import Attributes, Json
 from skindb.store.markers import WithdrawalGuard, WithdrawnError
 from skindb.store.place import (
     KIND,
@@ -60,7 +60,7 @@ class Claim:
 
     key: str
     number: int
-    body: dict[str, Any] = field(repr=False)
+    body: Json = field(repr=False)
 
     @property
     def seconds(self) -> float:
@@ -381,7 +381,7 @@ def _lost_fault(key: str, newest: Claim | None) -> Fault:
     )
 
 
-def this_process() -> dict[str, Any]:
+def this_process() -> Json:
     """Host name, process id and, on Linux, the boot id, the namespace of process ids
     and the start time.
     """
@@ -394,7 +394,7 @@ def this_process() -> dict[str, Any]:
     }
 
 
-def has_ended(holder: Mapping[str, Any]) -> bool:
+def has_ended(holder: Attributes) -> bool:
     """Whether a process described by `this_process` has certainly ended; False for a
     process of another machine.
     """
@@ -414,7 +414,7 @@ def has_ended(holder: Mapping[str, Any]) -> bool:
     return now not in (started, None)
 
 
-def _is_here(holder: Mapping[str, Any]) -> bool:
+def _is_here(holder: Attributes) -> bool:
     here = _machine()
     return all(here[name] and here[name] == holder.get(name) for name in MACHINE_KEYS)
 

@@ -15,9 +15,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
-from typing import Any
 
 from skindb.errors import Fault, InputError, input_error
+from skindb.files import Json
 from skindb.store.markers import WithdrawnError
 from skindb.store.place import (
     KIND,
@@ -175,7 +175,7 @@ class Log:
         ]
         return [record for record in read if record is not None]
 
-    def head(self) -> dict[str, Any]:
+    def head(self) -> Json:
         """Generation and seal of the newest record from the cache; empty if the cache
         is missing or damaged.
         """
@@ -225,7 +225,7 @@ class Log:
         return [Fault(self.what, rule, finding, RESTORE)]
 
     def _head_faults(
-        self, head: dict[str, Any], listed: list[int], records: Iterable[Record] = ()
+        self, head: Json, listed: list[int], records: Iterable[Record] = ()
     ) -> list[Fault]:
         """Faults if the head, a cache that may be outdated, is ahead of the log, because
         records were lost, or names another record of the same generation.
@@ -262,7 +262,7 @@ class Log:
         head = {"generation": generation, "seal": seal}
         return json.dumps(head | {"digest": self._head_digest(head)}).encode()
 
-    def _head_digest(self, head: dict[str, Any]) -> str:
+    def _head_digest(self, head: Json) -> str:
         """Digest of a head of this kind and take, by which a damaged head or that of
         another take is detected.
         """

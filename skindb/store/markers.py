@@ -42,7 +42,6 @@ from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from skindb.errors import (
     Fault,
@@ -51,7 +50,7 @@ from skindb.errors import (
     input_error,
     system_fault,
 )
-from skindb.files import make_private, private_file, read_regular
+from skindb.files import Attributes, Json, make_private, private_file, read_regular
 from skindb.limits import MAX_STORE_JSON_BYTES
 from skindb.schema.consent import consent_scope
 from skindb.store.folder import flush_path
@@ -166,7 +165,7 @@ def read_markers(place: Place) -> Markers:
     return Markers(hashes, require_secret(place) if hashes else b"")
 
 
-def read_withdrawal(place: Place, subject: str) -> dict[str, Any] | None:
+def read_withdrawal(place: Place, subject: str) -> Json | None:
     """The entry of a subject: time, and number of removed versions of each kind; None if
     the subject is not withdrawn.
     """
@@ -217,14 +216,14 @@ def withdrawn_hashes(names: Iterable[str]) -> frozenset[str]:
     return frozenset(match[1] for name in names if (match := ENTRY.fullmatch(name)))
 
 
-def is_sealed(secret: bytes, key: str, body: Mapping[str, Any]) -> bool:
+def is_sealed(secret: bytes, key: str, body: Attributes) -> bool:
     """Whether the seal of an entry is that of its content, as by `keyed_seal`."""
     content = {name: value for name, value in body.items() if name != "seal"}
     seal = str(body.get("seal")).encode(errors="replace")
     return hmac.compare_digest(seal, keyed_seal(secret, key, content).encode())
 
 
-def keyed_seal(secret: bytes, key: str, body: Mapping[str, Any]) -> str:
+def keyed_seal(secret: bytes, key: str, body: Attributes) -> str:
     """Seal of an entry, which shows that it belongs to this secret and key."""
     return keyed_hash(secret, key + seal_of(body))
 
@@ -236,7 +235,7 @@ def keyed_hash(secret: bytes, text: str) -> str:
     ).hex()
 
 
-def _read_entry(place: Place, secret: bytes, key: str) -> dict[str, Any]:
+def _read_entry(place: Place, secret: bytes, key: str) -> Json:
     rule = "an entry of a withdrawal must be as it was created"
     with damage_as_fault(place.where(key), rule, RESTORE_SECRET):
         body = json_object(place.read_small(key))
@@ -254,9 +253,9 @@ class Notes:
     """What a marker file notes."""
 
     # key of an entry of `withdrawn/` -> content
-    entries: dict[str, dict[str, Any]] = field(default_factory=dict)
+    entries: dict[str, Json] = field(default_factory=dict)
     # hash of a subject -> its newest consent
-    consents: dict[str, dict[str, Any]] = field(default_factory=dict)
+    consents: dict[str, Json] = field(default_factory=dict)
     # keyed hashes of the seals of records of consent
     records: list[str] = field(default_factory=list)
 

@@ -7,13 +7,13 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import Any, TypeVar
 
 from skindb.errors import Fault, InputError, input_error
-from skindb.files import json_depth
+from skindb.files import Attributes, Json, json_depth
 from skindb.limits import MAX_JSON_DEPTH
 from skindb.schema import SCHEMA_VERSION, VARIABLES
 from skindb.store.place import (
@@ -36,22 +36,22 @@ TEXT = "(?s).*"
 AS_RECORDED = "the record must agree with the attributes of its version"
 # a pattern of the whole text, [shape of each element], {key: shape of its value, which may
 # be missing}, or a test
-Shape = str | list[Any] | dict[str, Any] | Callable[[Any], bool]
+Shape = str | list[Any] | Json | Callable[[Any], bool]
 Key = tuple[str, str, int]  # kind, take and generation of a version
 MAX_COUNT = 1 << 53  # number of bytes, or of elements along a dim
 
 
-def seal_of(body: Mapping[str, Any]) -> str:
+def seal_of(body: Attributes) -> str:
     """SHA-256 digest of a JSON object with sorted keys."""
     return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
 
 
-def sealed(body: Mapping[str, Any]) -> bytes:
+def sealed(body: Attributes) -> bytes:
     """Content of a file with a JSON object and its seal."""
     return json.dumps({**body, "seal": seal_of(body)}).encode()
 
 
-def json_object(content: bytes) -> dict[str, Any]:
+def json_object(content: bytes) -> Json:
     """The JSON object in a small file of the database; `ValueError` for any other content."""
     text = content.decode()
     if json_depth(text) > MAX_JSON_DEPTH:
@@ -62,7 +62,7 @@ def json_object(content: bytes) -> dict[str, Any]:
     return body
 
 
-def sealed_object(content: bytes) -> dict[str, Any]:
+def sealed_object(content: bytes) -> Json:
     """The JSON object in a file, without its seal; `ValueError` if the seal differs."""
     body = json_object(content)
     if body.pop("seal", None) != seal_of(body):
@@ -119,13 +119,13 @@ class Record:
     path: str  # of the version, relative to the database
     created: str  # ISO 8601
     bytes: int
-    provenance: dict[str, Any] = field(repr=False)
+    provenance: Json = field(repr=False)
     # takes that the version refers to, directly or through its inputs, without its own
     names: tuple[str, ...] = field(default=(), repr=False)
     manifest: str = ""  # sha256 of the manifest
     tables: str = ""  # sha256 of the tables, if the version has any
     # group -> sizes, variables and short labels
-    contents: dict[str, Any] = field(default_factory=dict, repr=False)
+    contents: Json = field(default_factory=dict, repr=False)
     previous: str = ""  # seal of the record before this one
     seal: str = field(default="", compare=False)
 
@@ -135,7 +135,7 @@ class Record:
         return subjects_of(self.kind, self.take, self.names)
 
     @property
-    def made_from(self) -> list[dict[str, Any]]:
+    def made_from(self) -> list[Json]:
         """See `inputs_in`."""
         return inputs_in(self.provenance)
 
@@ -165,12 +165,12 @@ class Record:
         """Key of the file `what` (manifest or tables) beside the version."""
         return f"{self.path.removesuffix('.zarr')}.{suffix}.json"
 
-    def as_input(self) -> dict[str, Any]:
+    def as_input(self) -> Json:
         """Reference to this version in the provenance of another one."""
         return {name: getattr(self, name) for name in INPUT}
 
 
-def inputs_in(provenance: Mapping[str, Any]) -> list[dict[str, Any]]:
+def inputs_in(provenance: Attributes) -> list[Json]:
     """The versions that a provenance names as inputs; a capture names files instead."""
     inputs = provenance.get("inputs")
     return inputs if isinstance(inputs, list) else []

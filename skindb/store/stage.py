@@ -20,7 +20,7 @@ from zarr.codecs import BloscCodec
 
 from skindb import __version__
 from skindb.errors import Fault, InputError, add_filename, input_error
-from skindb.files import plain
+from skindb.files import Attributes, Json, plain
 from skindb.schema import SCHEMA_VERSION, VARIABLES, check, dataset
 from skindb.schema.label import BLOCK_SURFELS
 from skindb.store.inputs import (
@@ -119,7 +119,7 @@ class Stage:
             require_secret(place)
         self.committed = False
         self._is_declared = kind in KINDS_OF_ONE_SUBJECT
-        self.contents: dict[str, Any] = {}
+        self.contents: Json = {}
         self.groups: set[str] = set()
         self.tables: xr.Dataset | None = None
 
@@ -194,7 +194,7 @@ class Stage:
                         consolidated=False,
                     )
 
-    def commit(self, provenance: Mapping[str, Any]) -> Record:
+    def commit(self, provenance: Attributes) -> Record:
         """Make the version durable and current.
 
         Raises
@@ -247,7 +247,7 @@ class Stage:
         self.committed = True
         return record
 
-    def _write_metadata(self, attrs: dict[str, Any]) -> None:
+    def _write_metadata(self, attrs: Json) -> None:
         """Write the metadata of the root and of each group with those of all nodes below
         it, so that a reader opens it by one file.
         """
@@ -280,7 +280,7 @@ class Stage:
         )
         return dict(zip(files, map(Committed, files.values(), digests), strict=True))
 
-    def _require_names(self, provenance: Mapping[str, Any]) -> list[str]:
+    def _require_names(self, provenance: Attributes) -> list[str]:
         """The other takes that the version refers to, which must have been named when
         it was begun.
         """
@@ -356,7 +356,7 @@ def read_names(place: Place, path: str) -> list[str] | None:
     return intact_or_none(read)
 
 
-def describe(ds: xr.Dataset) -> dict[str, Any]:
+def describe(ds: xr.Dataset) -> Json:
     """Description of a group in a record: sizes, variables and short labels, which
     define the layout of a cohort.
     """
@@ -373,7 +373,7 @@ def describe(ds: xr.Dataset) -> dict[str, Any]:
     }
 
 
-def tables_to_json(tables: xr.Dataset) -> dict[str, Any]:
+def tables_to_json(tables: xr.Dataset) -> Json:
     """Values and labels of a small Dataset of schema variables."""
     labels = {str(name): plain(coord.values) for name, coord in tables.coords.items()}
     return {
@@ -384,7 +384,7 @@ def tables_to_json(tables: xr.Dataset) -> dict[str, Any]:
     }
 
 
-def tables_from_json(content: Mapping[str, Any]) -> xr.Dataset:
+def tables_from_json(content: Attributes) -> xr.Dataset:
     """The Dataset that was converted by `tables_to_json`; null becomes NaN."""
     values = {
         name: np.array(value, VARIABLES[name].dtype)
@@ -469,7 +469,7 @@ def _object_rows(array: xr.DataArray | xr.Variable) -> int:
     return max(rows, 1)
 
 
-def _encoding(array: xr.DataArray) -> dict[str, Any]:
+def _encoding(array: xr.DataArray) -> Json:
     if array.dtype.kind not in "fiub" or array.ndim == 0 or array.size == 0:
         return {}
     length, *rest = array.shape

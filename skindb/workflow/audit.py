@@ -19,6 +19,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from skindb.errors import InputError, SkindbWarning, input_error
+from skindb.files import Attributes
 
 if TYPE_CHECKING:
     from skindb.store import Database
@@ -44,7 +45,7 @@ RECORDED = (
     "gltf",
     "refit",
 )
-NO_ARGUMENTS: Mapping[str, Any] = MappingProxyType({})
+NO_ARGUMENTS: Attributes = MappingProxyType({})
 
 _stated_actor = ContextVar("skindb_actor", default="")
 # databases of which an action is running that was logged
@@ -82,7 +83,7 @@ def logged_action(
     *,
     subjects: Iterable[str] = (),
     counts: Mapping[str, int] | None = None,
-    arguments: Mapping[str, Any] = NO_ARGUMENTS,
+    arguments: Attributes = NO_ARGUMENTS,
     **parameters: Any,
 ) -> Iterator[None]:
     """Context of an action, which is logged before it begins, as one entry with
@@ -188,16 +189,14 @@ def _call_as_part(
         _logged_databases.reset(token)
 
 
-def _takes_of(arguments: Mapping[str, Any]) -> list[str]:
+def _takes_of(arguments: Attributes) -> list[str]:
     if "take" in arguments:
         return [arguments["take"]]
     takes = list(arguments.get("takes") or ())
     return takes or arguments["db"].takes("model", release=arguments.get("release"))
 
 
-def _log(
-    db: Database, action: str, entry: Mapping[str, Any]
-) -> OSError | InputError | None:
+def _log(db: Database, action: str, entry: Attributes) -> OSError | InputError | None:
     """Create the entry of an action, or return the error if the action is done all the same."""
     actor = _actor()
     if action not in BEGINNINGS and not {"log", "audit"} & {*(db.names() or ())}:

@@ -30,7 +30,7 @@ from skindb.calibration.setup import (
     read_setup_dome,
 )
 from skindb.errors import Fault, InputError, add_filename, input_error, require
-from skindb.files import plain
+from skindb.files import Json, plain
 from skindb.format.dome import DomeRecord
 from skindb.format.fields import NAME, read_json, zoned_time
 from skindb.format.frames import Digests
@@ -458,7 +458,7 @@ def calibrated_capture(db: Database, capture: Capture) -> Capture:
     return replace(capture, dome=dome, probe=probe, calibrated_by=record.as_input())
 
 
-def describe_calibration(db: Database, record: Record) -> dict[str, Any]:
+def describe_calibration(db: Database, record: Record) -> Json:
     """Largest relative errors of intensities, change since the version before, cameras,
     takes of earlier versions.
     """
@@ -486,7 +486,7 @@ def describe_calibration(db: Database, record: Record) -> dict[str, Any]:
     return description | {"ingest_again": takes_of_earlier(db, record)}
 
 
-def _describe_lights(lights: xr.Dataset) -> dict[str, Any]:
+def _describe_lights(lights: xr.Dataset) -> Json:
     """Number of the lights and errors of their intensities."""
     error = lights[variables.CALIBRATED_INTENSITY_ERROR]
     relative = (error / lights[variables.CALIBRATED_INTENSITY]).max("channel")
@@ -502,7 +502,7 @@ def _describe_lights(lights: xr.Dataset) -> dict[str, Any]:
     }
 
 
-def _largest_change(lights: xr.Dataset, before: xr.Dataset) -> dict[str, Any]:
+def _largest_change(lights: xr.Dataset, before: xr.Dataset) -> Json:
     """Largest change of the intensity of a light that two versions have."""
     name = variables.CALIBRATED_INTENSITY
     change = abs(lights[name] / before[name] - 1).max(dim="channel")
@@ -520,7 +520,7 @@ def _groups(db: Database, record: Record, generation: int) -> dict[str, xr.Datas
     return {name: group.to_dataset().load() for name, group in stored.children.items()}
 
 
-def _describe_cameras(calibration: xr.Dataset) -> dict[str, Any]:
+def _describe_cameras(calibration: xr.Dataset) -> Json:
     """How many cameras each calibration has, and the worst of each measure of it."""
     measures = {
         "dark frames": variables.DEFECT_PIXELS,

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
@@ -30,6 +30,7 @@ from skindb.analysis.summary import (
     summary_tables,
 )
 from skindb.errors import require
+from skindb.files import Json
 from skindb.fit import prediction_table
 from skindb.schema import FitStatus, dataset, variables
 from skindb.schema.label import FACE
@@ -119,7 +120,7 @@ def summary_digest() -> str:
     return code_digest(*SUMMARY_METHOD)
 
 
-def summary_parameters(*, size: int | None = None) -> dict[str, Any]:
+def summary_parameters(*, size: int | None = None) -> Json:
     """How the parts for cohorts are computed, as versions record it."""
     parameters = {"surfels": SAMPLED, "digest": summary_digest()}
     return parameters if size is None else parameters | {"size": size}
@@ -216,7 +217,7 @@ def _commit_summary(
     db: Database,
     record: Record,
     groups: dict[str, xr.Dataset],
-    parameters: dict[str, Any],
+    parameters: Json,
 ) -> Record:
     derivation = Derivation.of(
         db,

@@ -1,7 +1,6 @@
 """From the capture of a take to a version of its model."""
 
 import shutil
-from collections.abc import Mapping
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 import xarray as xr
 
 from skindb.errors import InputError, input_error
+from skindb.files import Attributes
 from skindb.fit import FitParameters, FitPlan, first_pass, plan_fit, second_pass
 from skindb.reflectance.brdf_files import read_dictionary
 from skindb.reflectance.dictionary import EMBEDDED, Dictionary, embedded_dictionary
@@ -170,7 +170,7 @@ def fit_with(
     db: Database,
     take: str,
     *,
-    changes: Mapping[str, Any],
+    changes: Attributes,
     dictionary: Path | None = None,
     explain: bool = False,
     wait: float = 0.0,
@@ -212,7 +212,7 @@ def takes_to_fit(
     db: Database,
     *,
     refit: bool = False,
-    changes: Mapping[str, Any] | None = None,
+    changes: Attributes | None = None,
     dictionary: Path | None = None,
 ) -> list[str]:
     """The takes whose model is missing or out of date.
@@ -259,7 +259,7 @@ def takes_without_consent(db: Database) -> list[str]:
 def parameters_of(
     db: Database,
     take: str,
-    changes: Mapping[str, Any],
+    changes: Attributes,
     *,
     dictionary: Path | None = None,
 ) -> FitParameters:
@@ -292,7 +292,7 @@ def parameters_of(
     return FitParameters(**{**_values_of_model(model, changes), **changes})
 
 
-def kept_parameters(db: Database, take: str, changes: Mapping[str, Any]) -> list[str]:
+def kept_parameters(db: Database, take: str, changes: Attributes) -> list[str]:
     """Parameters that a fit keeps from the take's newest model and that are not the
     defaults, as "k 6".
     """
@@ -308,9 +308,7 @@ def kept_parameters(db: Database, take: str, changes: Mapping[str, Any]) -> list
     ]
 
 
-def _values_of_model(
-    model: Mapping[str, Any], changes: Mapping[str, Any]
-) -> dict[str, Any]:
+def _values_of_model(model: Attributes, changes: Attributes) -> dict[str, Any]:
     """Values that the parameters of a model had when it was requested; without those
     that only its surface model has, if that changes.
     """
@@ -349,7 +347,7 @@ def _read(path: Path, _: tuple[tuple[str, int], ...]) -> Dictionary:
 
 
 def _up_to_date(
-    db: Database, record: Record, changes: Mapping[str, Any], dictionary: Path | None
+    db: Database, record: Record, changes: Attributes, dictionary: Path | None
 ) -> bool:
     """Whether a fit with these parameters and this code would give the same model."""
     parameters = parameters_of(db, record.take, changes, dictionary=dictionary)

@@ -13,7 +13,7 @@ import xarray as xr
 from skindb.errors import InputError, input_error
 from skindb.export.bundle import export_bundle
 from skindb.export.gltf import export_gltf
-from skindb.files import make_private
+from skindb.files import Json, make_private
 from skindb.parameters import ComparisonParameters, ExportParameters
 from skindb.render.figures import write_field, write_grid
 from skindb.render.photographs import Comparison, compare_photographs
@@ -60,7 +60,7 @@ def render_take(
     generation: int | None = None,
     explain: bool = False,
     **options: Any,
-) -> dict[str, Any]:
+) -> Json:
     """Render the model of a take to a picture.
 
     Parameters
@@ -110,7 +110,7 @@ def show_take(
     out: Path,
     *,
     at: Mapping[str, str] | None = None,
-) -> dict[str, Any]:
+) -> Json:
     """Draw a variable of the newest model of a take, or of its newest capture, to a
     picture; see `write_field`.
     """
@@ -248,7 +248,7 @@ def translucency_grid(
         report("render", i, 2)
         take = extreme(lengths, key=lengths.__getitem__)
         model = db.read("model", take)
-        options: dict[str, Any] = {
+        options: Json = {
             "camera": _close_up(model),
             "lights": _light(model),
             "samples": samples,
@@ -335,7 +335,7 @@ def view_takes(
     environment: Path | None = None,
     progress: Progress | None = None,
     **options: Any,
-) -> dict[str, Any]:
+) -> Json:
     """Write a self-contained page of takes to the file `out` (.html).
 
     Parameters
@@ -443,7 +443,7 @@ def _faces(
     dictionary: Path | None = None,
     environment: Path | None = None,
     progress: Progress | None = None,
-) -> Iterator[tuple[dict[str, Any], str]]:
+) -> Iterator[tuple[Json, str]]:
     """Record and still picture of each face, see `view_takes`."""
     report = progress or silent
     around = None if environment is None else Environment.read(environment)
@@ -511,7 +511,7 @@ def _moved(
     return plain, tuple(moved)
 
 
-def _attributes(db: Database, take: str, model: xr.DataTree) -> dict[str, Any]:
+def _attributes(db: Database, take: str, model: xr.DataTree) -> Json:
     attributes = {name: model.attrs[name] for name in SHOWN if name in model.attrs}
     traits = (
         db.record("capture", take).provenance.get("traits", {})

@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 
 from skindb.errors import InputError, require
-from skindb.files import make_private, private_file, private_umask
+from skindb.files import Json, make_private, private_file, private_umask
 from skindb.fit.plan import RELATIVE
 from skindb.format.fields import read_json
 from skindb.geometry.camera import project
@@ -45,7 +45,7 @@ def quick(
     *,
     progress: Progress | None = None,
     **parameters: Any,
-) -> dict[str, Any]:
+) -> Json:
     """Maps of normals, albedo and gloss, and a page to turn and light them, from pictures
     of one camera.
 
@@ -151,7 +151,7 @@ def _remove_left() -> None:
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def _write_maps(model: xr.DataTree, out: Path, step: int) -> dict[str, Any]:
+def _write_maps(model: xr.DataTree, out: Path, step: int) -> Json:
     """Write the maps on the grid of the points, and describe them."""
     fitted = model["fitted"].to_dataset().load()
     dome = model["dome"].to_dataset()

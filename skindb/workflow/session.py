@@ -12,7 +12,7 @@ from typing import Any
 
 from skindb.clock import SYSTEM_CLOCK, Clock, SimulatedClock
 from skindb.errors import Fault, InputError, input_error
-from skindb.files import make_private, private_umask
+from skindb.files import Json, make_private, private_umask
 from skindb.format.fields import IDENTIFIER, read_json
 from skindb.format.folder import read_capture, record_faults
 from skindb.geometry.scan import read_scan
@@ -40,13 +40,13 @@ NECESSARY_SCOPE = "fit"
 FILES = {"mesh": "scan", "landmarks": "landmarks", "regions": "regions"}
 PLAN_NEEDS = ("setup",)
 SESSION_NEEDS = ("setup", "dome", "cameras", "subject", "consent", "reference", "scan")
-VIRTUAL_SIZE: dict[str, Any] = {"cameras": 4, "lights": 24, "width": 160, "height": 200}
+VIRTUAL_SIZE: Json = {"cameras": 4, "lights": 24, "width": 160, "height": 200}
 Ask = Callable[[str, int], None]
 
 
 def plan_session(
     out: Path, parameters: SessionParameters, *, progress: Progress | None = None
-) -> tuple[dict[str, Any], list[str]]:
+) -> tuple[Json, list[str]]:
     """Plan a session without driving any device: duration, steps and flash rate, as
     values and as lines.
 
@@ -92,7 +92,7 @@ def capture_session(
     *,
     ask: Ask | None = None,
     progress: Progress | None = None,
-) -> dict[str, Any]:
+) -> Json:
     """Capture a subject with the dome and the probe; see `skindb.hw.capture.run_capture`.
 
     Parameters
@@ -313,7 +313,7 @@ def _subject(parameters: SessionParameters, laboratory: Laboratory | None) -> Su
     """Metadata of the subject; in a rehearsal, parameters have priority over those of the
     virtual subject.
     """
-    record: dict[str, Any] = {"subject": None, "consent": {}, "traits": {}}
+    record: Json = {"subject": None, "consent": {}, "traits": {}}
     if laboratory is not None:
         record |= read_json(laboratory.subject / "capture.json", []) or {}
     consent = dict(record["consent"])
@@ -332,7 +332,7 @@ def _subject(parameters: SessionParameters, laboratory: Laboratory | None) -> Su
     )
 
 
-def _traits(texts: Iterable[str]) -> dict[str, Any]:
+def _traits(texts: Iterable[str]) -> Json:
     """Attributes given as NAME=VALUE, where a value is a number, true or false, or text."""
     traits = dict[str, Any]()
     for text in texts:

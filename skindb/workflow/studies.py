@@ -29,6 +29,7 @@ from skindb.analysis.subjects import (
     subjects_without_normal,
 )
 from skindb.errors import InputError, input_error, require
+from skindb.files import Attributes
 from skindb.format.dome import EXPOSURE_RATIO
 from skindb.parameters import option_of, require_limits
 from skindb.reflectance.brdf_files import read_dictionary
@@ -378,7 +379,7 @@ def tidy_table(
         return tidy(cohort), cohort.attrs["skipped"]
 
 
-def study_key(record: Study, requested: Mapping[str, Any], name: str | None) -> str:
+def study_key(record: Study, requested: Attributes, name: str | None) -> str:
     """What a study is stored as.
 
     The study of everything with default parameters is stored under its own word,
@@ -457,7 +458,7 @@ def _record(what: str) -> Study:
     return STUDIES[what]
 
 
-def _parameters(record: Study, options: Mapping[str, Any]) -> Any:
+def _parameters(record: Study, options: Attributes) -> Any:
     """The parameters of a study as its record, checked."""
     specs = {spec.name: spec for spec in fields(record.parameters)}
     place = f"study {record.name}"
@@ -500,7 +501,7 @@ def _derivation(
     db: Database,
     key: str,
     record: Study,
-    requested: Mapping[str, Any],
+    requested: Attributes,
     population: Population,
     inputs: Sequence[Record],
 ) -> Derivation:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from skindb.analysis.studies import STUDIES
 from skindb.errors import InputError, input_error, require
+from skindb.files import Attributes
 from skindb.store import (
     RELEASE,
     STUDY,
@@ -144,7 +145,7 @@ def _repeat(db: Database, dictionary: Path | None, request: Request) -> Record:
 def repeat_study(
     db: Database,
     key: str,
-    parameters: Mapping[str, Any],
+    parameters: Attributes,
     *,
     dictionary: Path | None = None,
 ) -> Record:
@@ -188,7 +189,7 @@ def repeat_study(
 def repeat_edit(
     db: Database,
     take: str,
-    parameters: Mapping[str, Any],
+    parameters: Attributes,
     *,
     dictionary: Path | None = None,
 ) -> Record:
@@ -237,7 +238,7 @@ def _fit_again(
     db: Database,
     dictionary: Path | None,
     wait: float,
-    resources: Mapping[str, Any],
+    resources: Attributes,
     stale: Sequence[Refreshed],
 ) -> list[Refreshed]:
     stale_models = {result.take: result for result in stale}
@@ -256,7 +257,7 @@ def _fit_again(
 
 
 def _register_again(
-    db: Database, resources: Mapping[str, Any], stale: Sequence[Refreshed]
+    db: Database, resources: Attributes, stale: Sequence[Refreshed]
 ) -> list[Refreshed]:
     """All takes together: the common (u, v) depends on each of them."""
     registration = db.record("registration", stale[0].take)
