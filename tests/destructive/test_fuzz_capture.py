@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-CASES = 18
+CASES = 10
 SEED = 2005
 
 

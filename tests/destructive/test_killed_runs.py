@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 RUNS = (
-    "kill_fit --cases 3 --seed 3",
-    "kill_withdraw --cases 2",
+    "kill_fit --cases 1 --seed 3",
+    "kill_withdraw --cases 1",
     "kill_backup --every 90",
     "stop_lease --cases 1",
     "race_lease --commits 16 --kills 3",
-    "power_loss --every 150",
+    "power_loss --every 300",
 )
 
 

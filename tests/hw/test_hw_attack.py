@@ -9,7 +9,7 @@ from attack_devices import attacked_setup, violations
 
 pytestmark = pytest.mark.slow
 
-CASES = 120
+CASES = 60
 
 
 @pytest.mark.destructive

@@ -18,7 +18,7 @@ from traces import contents
 from skindb.schema import dataset
 from skindb.store import Database, Record
 
-DATABASES = 120
+DATABASES = 60
 # pseudonyms, and at the same time words of messages, sites, regions, attributes,
 # studies, releases and conditions
 WORDS = (
