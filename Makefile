@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-all commands notebooks lint types docs clean
+.PHONY: demo test test-all suite pages readme commands notebooks lint types docs clean
 
 demo: $(STAMP)
 	$(BIN)/skindb demo --out demo
@@ -13,12 +13,21 @@ test: $(STAMP)
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile -m "not slow"
 
 # every test, then what pages state: the schema, words and commands of all pages, the README, notebooks, the site
-test-all: $(STAMP)
+test-all:
+	$(MAKE) suite
+	$(MAKE) pages
+	$(MAKE) readme
+	$(MAKE) --jobs 2 --output-sync=target commands notebooks
+
+suite: $(STAMP)
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
+
+pages: $(STAMP)
 	$(BIN)/python docs/make_variables.py --check
 	$(BIN)/python .ci/check_docs.py
+
+readme: $(STAMP)
 	$(BIN)/python .ci/check_readme.py
-	$(MAKE) --jobs 2 --output-sync=target commands notebooks
 
 # the commands of the pages and the notebooks, each on a copy of the database of `make demo`
 commands: $(STAMP)
