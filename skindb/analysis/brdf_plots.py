@@ -46,24 +46,16 @@ def plot_brdf_space(space: Dataset, *, ax: Axes | None = None) -> Axes:
     """
     ax = ax or plots.new_axes(5, 4.4)
     named = np.array(space.attrs["groups_of_takes"])
-    place = space[variables.TAKE_PLACE].values
-    for i, (group, count) in enumerate(
-        zip(
-            space["group"].values,
-            space[variables.GROUP_SUBJECT_COUNT].values,
-            strict=True,
-        )
-    ):
-        points = place[named == str(group)]
-        takes = int((named == str(group)).sum())
-        subjects = f"n = {count}" if takes == count else f"n = {count}, {takes} takes"
+    for i, (group, count) in enumerate(_groups(space)):
+        points = space[variables.TAKE_PLACE].values[named == group]
+        takes = "" if len(points) == count else f", {len(points)} takes"
         ax.plot(
             *points.T,
             MARKERS[i % 6],
             color=_colour(i),
             markersize=4,
             alpha=0.75,
-            label=f"{group} ({subjects})",
+            label=f"{group} (n = {count}{takes})",
         )
     horizontal, second = (
         f"{fraction:.1%}" for fraction in space[variables.EXPLAINED_FRACTION].values
@@ -92,27 +84,27 @@ def plot_group_spheres(space: Dataset, *, ax: Axes | None = None) -> Axes:
     ax
         Axes to draw on; by default new ones.
     """
-    names = space["group"].values.tolist()
-    columns = min(len(names), SPHERES_PER_ROW)
-    rows = -(-len(names) // columns)
+    groups = _groups(space)
+    columns = min(len(groups), SPHERES_PER_ROW)
+    rows = -(-len(groups) // columns)
     ax = ax or plots.new_axes(1.6 * columns + 0.4, 1.9 * rows + 0.4)
     radiance, inside = sphere_radiance(_tables(space))
     white = float(np.percentile(radiance[inside], WHITE_PERCENTILE)) or 1.0
     step_x = 1.1
     step_y = 1.35
-    for i, name in enumerate(names):
+    for i, (name, count) in enumerate(groups):
         x = step_x * (i % columns)
         y = -step_y * (i // columns)
-        picture = np.ones((*inside.shape, 3))
-        picture[inside] = np.clip(radiance[inside][:, i, None] / white, 0, 1) ** (
-            1 / GAMMA
-        )
+        shades = np.clip(radiance[..., i] / white, 0, 1) ** (1 / GAMMA)
         ax.imshow(
-            picture,
+            np.where(inside, shades, 1.0),
+            cmap="gray",
+            vmin=0,
+            vmax=1,
             extent=(x - 0.5, x + 0.5, y - 0.5, y + 0.5),
             interpolation="antialiased",
         )
-        label = f"{name}\n(n = {int(space[variables.GROUP_SUBJECT_COUNT][i])})"
+        label = f"{name}\n(n = {count})"
         ax.text(x, y - 0.53, label, ha="center", va="top", fontsize=8)
     ax.set_xlim(-0.6, step_x * (columns - 1) + 0.6)
     ax.set_ylim(-step_y * (rows - 1) - 0.9, 0.6)
@@ -144,15 +136,8 @@ def plot_group_lobes(space: Dataset, *, ax: PolarAxes | None = None) -> PolarAxe
         _, ax = pyplot.subplots(figsize=(6, 3.8), subplot_kw={"projection": "polar"})
     angle = np.radians(np.linspace(-MAX_EXITANCE, MAX_EXITANCE, 321))
     tables = _tables(space)
-    groups = list(
-        zip(
-            space["group"].values,
-            space[variables.GROUP_SUBJECT_COUNT].values,
-            strict=True,
-        )
-    )
     for incidence, line in zip(INCIDENCES, LINES, strict=True):
-        for i, (group, count) in enumerate(groups):
+        for i, (group, count) in enumerate(_groups(space)):
             values = lobe(tables[..., [i]], np.radians(incidence), angle)[:, 0]
             label = f"{group} (n = {count}), {incidence:.0f}°"
             ax.plot(angle, values, line, color=_colour(i), linewidth=1.2, label=label)
@@ -253,6 +238,12 @@ def _tables(space: Dataset) -> Float32:
         .values
     )
     return np.ascontiguousarray(stored[:, :, :-1])
+
+
+def _groups(space: Dataset) -> list[tuple[str, int]]:
+    """Names and numbers of subjects of the groups."""
+    counts = space[variables.GROUP_SUBJECT_COUNT].values.tolist()
+    return list(zip(space["group"].values.tolist(), counts, strict=True))
 
 
 def _colour(i: int) -> str:

@@ -7,6 +7,7 @@ Weyrich et al. 2005, section 10.1 and figures 7, 14 and 15.
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,9 @@ from skindb.analysis.study import (
     table_of,
 )
 from skindb.analysis.subjects import (
+    AGE,
     NORMAL,
+    OLDER,
     OTHER,
     UNKNOWN,
     Subjects,
@@ -38,7 +41,7 @@ from skindb.analysis.subjects import (
     takes_to_compare,
 )
 from skindb.analysis.summary import SAMPLED
-from skindb.errors import Fault, InputError, input_error, require
+from skindb.errors import Fault, InputError, require
 from skindb.numerics.inference import (
     between_groups_p,
     classical_scaling,
@@ -56,7 +59,7 @@ from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, store
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
 from skindb.threads import c_contiguous
-from skindb.types import AnyArray, Array, Mask, finite_rows
+from skindb.types import AnyArray, Array, Mask, finite_rows, unit
 
 # subjects of a group, below which p values are approximate if the groups have different
 # variances
@@ -153,16 +156,22 @@ def brdf_space(
     require_comparable(cohort, "tables")
     takes, named, flags = grouped_takes(cohort, group_by)
     coefficient = _coefficients(takes.take, basis)
-    [(metric, brdf)] = each_item(
-        _metric_and_basis(basis[variables.POPULATION_MIXTURE].values.astype(float)),
-        [tables],
-    )
-    place = coefficient @ _metric_root(metric)
+    mixture = basis[variables.POPULATION_MIXTURE].values.astype(float)
+    [(metric, brdf)] = each_item(partial(_metric_and_basis, mixture), [tables])
+    # R with R R^T = metric: the length of c R is that of the BRDF with the coefficients c
+    values, vectors = np.linalg.eigh(metric)
+    place = coefficient @ (vectors * np.sqrt(np.maximum(values, 0.0)))
     subjects = _by_subject(takes, named, coefficient, place)
     centre = known_mean(known_mean(np.moveaxis(subjects.place, 1, 0)))
     length = float(np.linalg.norm(centre)) or 1.0
     distance = np.linalg.norm(place[:, None] - place[None], axis=-1) / length
-    _require_different(distance, group_by)
+    require(
+        distance.max() > IDENTICAL,
+        f"group by {group_by}",
+        "the BRDFs of takes must differ",
+        "the same BRDF in all takes",
+        "check the fits",
+    )
     mapped, explained, error = classical_scaling(distance)
     pairs = [
         _compared_pair(subjects, pair, permutations, rng)
@@ -181,8 +190,12 @@ def brdf_space(
             variables.TAKE_PLACE: mapped,
             variables.EXPLAINED_FRACTION: explained,
             variables.MAP_ERROR: error,
-            **_distances(pairs, length),
+            variables.GROUP_DISTANCE: [pair.distance / length for pair in pairs],
+            variables.GROUP_DISTANCE_NOISE: [pair.noise / length for pair in pairs],
+            variables.GROUP_DISTANCE_P: [pair.p for pair in pairs],
             variables.GROUP_DISTANCE_P_ADJUSTED: adjusted,
+            variables.PAIR_SUBJECT_COUNT: [pair.count for pair in pairs],
+            variables.PAIR_PERMUTATIONS: [pair.permutations for pair in pairs],
         },
         coords={
             "group": list(subjects.groups),
@@ -202,17 +215,6 @@ def brdf_space(
     )
 
 
-def _require_different(distance: Array, group_by: str) -> None:
-    """Raise `InputError` if all distances (take, take) are 0 or, without a mean, NaN."""
-    require(
-        distance.max() > IDENTICAL,
-        f"group by {group_by}",
-        "the BRDFs of takes must differ",
-        "the same BRDF in all takes",
-        "check the fits",
-    )
-
-
 def grouped_takes(
     cohort: Dataset, group_by: str
 ) -> tuple[Subjects, list[str], list[str]]:
@@ -223,44 +225,40 @@ def grouped_takes(
     InputError
         If there are fewer than two groups or subjects, or if the attribute is numeric.
     """
-    if group_by in numeric_attributes(subjects_of(cohort)):
-        cure = (
-            "group by a trait, such as age:older"
-            if group_by == "age"
-            else "group by another attribute"
-        )
-        raise input_error(
-            f"group by {group_by}", "must not be numeric", "a numeric attribute", cure
-        )
+    where = f"group by {group_by}"
+    is_age = group_by == AGE
+    require(
+        group_by not in numeric_attributes(subjects_of(cohort)),
+        where,
+        "must not be numeric",
+        "a numeric attribute",
+        f"group by {f'a trait, such as {OLDER}' if is_age else 'another attribute'}",
+    )
     _, counted = takes_to_compare(cohort, group_by)
     named = groups_by(counted, group_by)
     rows = [i for i, name in enumerate(named) if name not in (UNKNOWN, OTHER)]
     groups = sorted({named[i] for i in rows})
-    if len(groups) < 2:
-        finding = f"only {groups[0]}" if groups else "no take with this attribute"
-        raise input_error(
-            f"group by {group_by}",
-            "there must be subjects of two groups",
-            finding,
-            "group by another attribute",
-        )
+    require(
+        len(groups) >= 2,
+        where,
+        "there must be subjects of two groups",
+        f"only {groups[0]}" if groups else "no take with this attribute",
+        "group by another attribute",
+    )
     subjects = counted.select(rows)
-    if len(subjects.names) < 2:
-        raise input_error(
-            f"group by {group_by}",
-            "there must be at least two subjects",
-            "one",
-            "add the takes of other subjects",
-        )
-    excluded = len(named) - len(rows)
-    flags = (
-        [
+    require(
+        len(subjects.names) >= 2,
+        where,
+        "there must be at least two subjects",
+        "one",
+        "add the takes of other subjects",
+    )
+    flags = []
+    if excluded := len(named) - len(rows):
+        flags.append(
             f"{excluded} of {len(named)} takes are excluded because they belong to none "
             "of the groups"
-        ]
-        if excluded
-        else []
-    )
+        )
     return subjects, [named[i] for i in rows], flags
 
 
@@ -269,18 +267,14 @@ def _coefficients(names: Sequence[str], basis: Dataset) -> Array:
     and for a dependent basis.
     """
     mixture = basis[variables.POPULATION_MIXTURE].values.astype(float)
-    lengths = np.linalg.norm(mixture, axis=1, keepdims=True)
-    values = np.linalg.svd(
-        mixture / np.where(lengths > 0, lengths, 1.0), compute_uv=False
+    rank = np.linalg.matrix_rank(unit(mixture), rtol=INDEPENDENT)
+    require(
+        rank == len(mixture),
+        "basis",
+        "the components must be linearly independent",
+        f"{len(mixture)} components of rank {rank}",
+        "choose a smaller k",
     )
-    rank = int((values > INDEPENDENT * values[0]).sum())
-    if rank < len(mixture):
-        raise input_error(
-            "basis",
-            "the components must be linearly independent",
-            f"{len(mixture)} components of rank {rank}",
-            "choose a smaller k",
-        )
     stored = basis[variables.TAKE_COEFFICIENT].reindex(take=list(names)).values
     if not (is_known := finite_rows(stored)).all():
         rule = "a take must have fitted surfels"
@@ -292,24 +286,10 @@ def _coefficients(names: Sequence[str], basis: Dataset) -> Array:
     return stored.astype(float)
 
 
-def _metric_and_basis(mixture: Array) -> Any:
-    """Function from tables to the Gram matrix (k, k) and the tables (nh, nd, np, k) of
-    the components.
-    """
-
-    def of(tables: AnyArray) -> tuple[Array, Array]:
-        weights = c_contiguous(mixture)
-        return weights @ brdf_metric(tables) @ weights.T, tables @ weights.T
-
-    return of
-
-
-def _metric_root(metric: Array) -> Array:
-    """Matrix R with R R^T = metric: the length of c R is that of the BRDF with the
-    coefficients c.
-    """
-    values, vectors = np.linalg.eigh(metric)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+def _metric_and_basis(mixture: Array, tables: AnyArray) -> tuple[Array, Array]:
+    """Gram matrix (k, k) and tables (nh, nd, np, k) of the components."""
+    weights = c_contiguous(mixture)
+    return weights @ brdf_metric(tables) @ weights.T, tables @ weights.T
 
 
 def _by_subject(
@@ -380,18 +360,6 @@ def _compared_pair(
     noise = length / np.sqrt(statistic) if statistic > 0 else np.nan
     name = " to ".join(subjects.groups[i] for i in pair)
     return _Pair(name, within, (first, second), length, noise, p, drawn)
-
-
-def _distances(pairs: Sequence[_Pair], length: float) -> dict[str, Array]:
-    """Variables of the pairs; distances in units of `length`."""
-    return {
-        variables.GROUP_DISTANCE: np.array([pair.distance for pair in pairs]) / length,
-        variables.GROUP_DISTANCE_NOISE: np.array([pair.noise for pair in pairs])
-        / length,
-        variables.GROUP_DISTANCE_P: np.array([pair.p for pair in pairs]),
-        variables.PAIR_SUBJECT_COUNT: np.array([pair.count for pair in pairs]),
-        variables.PAIR_PERMUTATIONS: np.array([pair.permutations for pair in pairs]),
-    }
 
 
 def _adjusted(
@@ -471,13 +439,13 @@ def compute(population: Population, parameters: Parameters) -> Results:
     k = parameters.k
     basis = population_basis(population.cohort, tables=tables, k=k, rng=rng)
     rank = basis.sizes["component"]
-    if rank < k:
-        raise input_error(
-            "k",
-            "must not be above the number of BRDFs of the dictionary or of surfels",
-            f"{k}, and {rank} of them",
-            "choose a smaller k",
-        )
+    require(
+        rank == k,
+        "k",
+        "must not be above the number of BRDFs of the dictionary or of surfels",
+        f"{k}, and {rank} of them",
+        "choose a smaller k",
+    )
     space = brdf_space(
         cohort,
         basis=basis,
