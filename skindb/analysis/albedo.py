@@ -24,7 +24,7 @@ from skindb.analysis.study import (
 )
 from skindb.analysis.subjects import grouped, level_error
 from skindb.analysis.summary import SAMPLED
-from skindb.errors import input_error, require
+from skindb.errors import require
 from skindb.numerics.statistics import SUMMARY, known_mean
 from skindb.numerics.texture import QUANTILES, quantile_levels
 from skindb.parameters import group_option
@@ -130,52 +130,40 @@ def _colours(take: Dataset, drawn: Dataset | None) -> Colours:
     defined by landmarks.
     """
     name = str(take["take"].values)
-    good = finite_rows(take[variables.DIFFUSE_REFLECTANCE].values) & (
-        take[variables.SURFEL_AREA].values > 0
+    colour = take[variables.DIFFUSE_REFLECTANCE].values.astype(float)
+    area = take[variables.SURFEL_AREA].values.astype(float)
+    good = finite_rows(colour) & (area > 0)
+    require(
+        good.any(),
+        name,
+        "a take of a population must have fitted surfels",
+        "none",
+        "skip the take or fit it again",
     )
-    if not good.any():
-        raise input_error(
-            name,
-            "a take of a population must have fitted surfels",
-            "none",
-            "skip the take or fit it again",
-        )
-    stored = _masks(take, good)
-    by_landmark: dict[str, Mask] = {}
+    masks = {}
     if drawn is not None and name in drawn["take"].values:
-        registered = drawn.sel(take=name)
-        same = np.array_equal(
-            registered[variables.SURFEL_INDEX].values[: len(good)][good],
-            take[variables.SURFEL_INDEX].values[good],
+        registered = drawn.sel(take=name).isel(surfel=slice(len(good)))
+        first, second = (
+            ds[variables.SURFEL_INDEX].values[good] for ds in (registered, take)
         )
         require(
-            same,
+            np.array_equal(first, second),
             name,
             "regions by landmarks must belong to the sampled surfels",
             "a different sample",
             "open both cohorts with the same seed",
         )
-        by_landmark = _masks(registered, good)
-    colour = take[variables.DIFFUSE_REFLECTANCE].values[good].astype(float)
-    area = take[variables.SURFEL_AREA].values[good].astype(float)
-    return Colours(colour, area, by_landmark | stored)
+        masks = _masks(registered, good)
+    return Colours(colour[good], area[good], masks | _masks(take, good))
 
 
 def _masks(take: Dataset, good: Mask) -> dict[str, Mask]:
     """Masks of the sampled surfels by region, for the regions that contain any."""
     if variables.REGION_MASK not in take:
         return {}
-    mask = (
-        take[variables.REGION_MASK]
-        .transpose("surfel", "region")
-        .values[: len(good)][good]
-        > 0
-    )
-    return {
-        str(name): mask[:, i]
-        for i, name in enumerate(take["region"].values)
-        if mask[:, i].any()
-    }
+    stored = take[variables.REGION_MASK].transpose("region", "surfel").values
+    masks = zip(map(str, take["region"].values), stored[:, good] > 0, strict=True)
+    return {name: mask for name, mask in masks if mask.any()}
 
 
 def _colour_axes(samples: Sequence[Colours]) -> tuple[Array, Array]:
@@ -336,11 +324,8 @@ def tabulate_albedo(table: Dataset, histograms: Dataset) -> Table:
     they are not grouped.
     """
     if not table.attrs["group_by"]:
-        return table_of(
-            histograms, [variables.ALBEDO_MEAN], ("take", "region", "channel")
-        )
-    names = [f"group_albedo_{name}" for name in SUMMARY]
-    return table_of(table, names, ("group", "region", "channel"))
+        return table_of(histograms, [variables.ALBEDO_MEAN])
+    return table_of(table, [f"group_albedo_{name}" for name in SUMMARY])
 
 
 @dataclass(frozen=True)
@@ -355,11 +340,7 @@ def albedo_and_texture(population: Population) -> Results:
     registered, whose landmarks draw the regions that captures lack.
     """
     if not population.registered:
-        return {
-            "albedo": albedo_histograms(
-                population.cohort,
-            )
-        }
+        return {"albedo": albedo_histograms(population.cohort)}
     drawn = population.open_cohort(
         "surfels",
         kind="registration",
@@ -367,14 +348,9 @@ def albedo_and_texture(population: Population) -> Results:
         variables=[variables.REGION_MASK, variables.SURFEL_INDEX],
     )
     maps = population.open_cohort("maps", size=texture.SIZE, variables=texture.MAPPED)
-    distributions = texture.texture_statistics(
-        maps,
-        landmarks=population.landmarks,
-    )
+    distributions = texture.texture_statistics(maps, landmarks=population.landmarks)
     histograms = albedo_histograms(
-        population.cohort,
-        regions=texture.REGIONS,
-        drawn=drawn,
+        population.cohort, regions=texture.REGIONS, drawn=drawn
     )
     return {"albedo": histograms, "texture": distributions}
 

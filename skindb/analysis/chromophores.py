@@ -584,9 +584,7 @@ STUDY = Study(
     parameters=Parameters,
     compute=compute,
     shown=("chromophores", "chromophore_table"),
-    tabulate=lambda _, table: table_of(
-        table, COLUMNS, ("group", "region", "chromophore")
-    ),
+    tabulate=lambda _, table: table_of(table, COLUMNS),
     plot=lambda _, table: plot_chromophores(table),
     describe=lambda axes, _: describe_chromophores(axes),
 )

@@ -205,7 +205,7 @@ def tabulate_components(table: Dataset) -> Table:
         for i in range(table.sizes["component"])
     }
     names = [*columns, variables.PRINCIPAL_RESIDUAL]
-    return table_of(table.assign(columns), names, ["take"])
+    return table_of(table.assign(columns), names)
 
 
 def describe_components(table: Dataset) -> list[str]:

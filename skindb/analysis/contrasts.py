@@ -112,24 +112,18 @@ def contrasts(
     names = quantities.subject
     attribute = subjects.by_subject(compared, names)
     covariates = _covariates(subjects, names, adjust, attribute)
-    if group_by not in everyone.attributes:
+    is_number = group_by in everyone.attributes and attribute.is_numeric
+    if group_by in everyone.attributes:
+        regressors = _regressors(attribute, group_by)
+    else:
         trait = trait_of(everyone, group_by)
         carries = _carriers(everyone, subjects, trait)
-        regressors = {
-            f"{trait} less others": np.array([carries.get(s, np.nan) for s in names])
-        }
-    else:
-        regressors = _regressors(attribute, group_by)
-    is_number = group_by in everyone.attributes and attribute.is_numeric
+        values = np.array([carries.get(name, np.nan) for name in names])
+        regressors = {f"{trait} less others": values}
     reliability = quantities.reliability
     return [
         Contrast(
-            name,
-            quantities,
-            regressor,
-            covariates,
-            reliability,
-            is_number,
+            name, quantities, regressor, covariates, reliability, is_number
         ).complete()
         for name, regressor in regressors.items()
     ]
@@ -254,19 +248,14 @@ def _paired(
             continue
         after = changed.of_subjects(both)
         normal = plain.of_subjects(both)
-        before = normal.values
-        difference = replace(after, values=after.values - before)
-        ones = np.ones(len(both))
-        nothing = np.empty((len(both), 0))
-        title = f"{name} less {NORMAL}"
         pairs.append(
             Contrast(
-                title,
-                difference,
-                ones,
-                nothing,
+                f"{name} less {NORMAL}",
+                replace(after, values=after.values - normal.values),
+                np.ones(len(both)),
+                np.empty((len(both), 0)),
                 normal.reliability,
-                before=before,
+                before=normal.values,
             )
         )
     require(
@@ -347,20 +336,15 @@ def contrast_flags(
     """Warnings about a comparison: few subjects, correlated attributes and extrapolation."""
     flags = _few_subjects(contrast)
     if not contrast.is_paired:
-        flags += _confounders(associated, adjust)
+        flags += [
+            f"is correlated with {name} (adjusted multiple correlation {value:.2f}); "
+            f"adjust for {name} if it may cause the effect"
+            for name, value in associated.items()
+            if value >= ASSOCIATED and name not in adjust
+        ]
         for name in adjust:
             flags += _extrapolations(contrast, subjects, name)
     return [f"{contrast.name}: {flag}" for flag in flags]
-
-
-def _confounders(associated: dict[str, float], adjust: Sequence[str]) -> list[str]:
-    """Warnings about attributes that are correlated with the compared one."""
-    return [
-        f"is correlated with {name} (adjusted multiple correlation {value:.2f}); "
-        f"adjust for {name} if it may cause the effect"
-        for name, value in associated.items()
-        if value >= ASSOCIATED and name not in adjust
-    ]
 
 
 def _few_subjects(contrast: Contrast) -> list[str]:

@@ -17,12 +17,11 @@ from skindb.analysis.study import (
     Population,
     Results,
     Study,
-    Table,
     skipped_takes,
     table_of,
 )
 from skindb.analysis.subjects import takes_to_compare
-from skindb.errors import input_error, require
+from skindb.errors import require
 from skindb.numerics.statistics import known_mean
 from skindb.parameters import permutations_option, seed_option
 from skindb.schema import dataset, variables
@@ -56,7 +55,6 @@ COLUMNS = (
 def component_correlations(
     cohort: Dataset,
     *,
-    region: str = FACE,
     permutations: int = 10_000,
     rng: Generator,
 ) -> Dataset:
@@ -64,15 +62,13 @@ def component_correlations(
     reflectance and translucency.
 
     Each subject counts once, in the condition normal. The values are the mean albedo
-    and surface reflectance of a region, and the mean over probe sites of log sigma_tr
+    and surface reflectance of the face, and the mean over probe sites of log sigma_tr
     after the mean of each site is subtracted.
 
     Parameters
     ----------
     cohort
         ``db.cohort("tables")``.
-    region
-        Region of which albedo and surface reflectance are used.
     permutations
         Maximum number of permutations for p values.
     rng
@@ -90,12 +86,11 @@ def component_correlations(
     Raises
     ------
     InputError
-        If the region is unknown, or if fewer than five subjects have two components.
+        If fewer than five subjects have two components.
     """
     require_comparable(cohort, "tables")
     takes, _ = takes_to_compare(cohort, None)
-    _require_region(takes, region)
-    values = _components(quantities_of(takes), region)
+    values = _components(quantities_of(takes))
     pairs = [
         pair
         for pair in combinations(range(len(COMPONENTS)), 2)
@@ -125,21 +120,17 @@ def component_correlations(
             variables.CORRELATION_COUNT: count,
         },
         coords={"pair": [f"{COMPONENTS[i]} with {COMPONENTS[j]}" for i, j in pairs]},
-        attrs={
-            "region": region,
-            "flags": flags,
-            "skipped": skipped_takes(cohort),
-        },
+        attrs={"flags": flags, "skipped": skipped_takes(cohort)},
     )
 
 
-def _components(quantities: Quantities, region: str) -> Array:
+def _components(quantities: Quantities) -> Array:
     """Values (subject, component); NaN where a subject lacks a component."""
     of_subjects = quantities.of_subjects()
     columns = dict(zip(of_subjects.names, of_subjects.values.T, strict=True))
     nothing = np.full(len(of_subjects.subject), np.nan)
-    out = [columns.get(f"R_d {region} {channel}", nothing) for channel in CHANNELS]
-    out.append(columns.get(f"{SURFACE} {region}", nothing))
+    out = [columns.get(f"R_d {FACE} {channel}", nothing) for channel in CHANNELS]
+    out.append(columns.get(f"{SURFACE} {FACE}", nothing))
     for channel in CHANNELS:
         sites = [
             x
@@ -154,17 +145,6 @@ def _components(quantities: Quantities, region: str) -> Array:
             else nothing
         )
     return np.stack(out, axis=1)
-
-
-def _require_region(takes: Dataset, region: str) -> None:
-    """Raise `InputError` if no take has a region of this name."""
-    if "region" in takes.coords and region not in takes["region"].values:
-        raise input_error(
-            f"region {region}",
-            "must be a region of the takes",
-            "an unknown name",
-            f"choose one of {', '.join(map(str, takes['region'].values))}",
-        )
 
 
 def _can_correlate(columns: Array) -> bool:
@@ -217,7 +197,7 @@ def describe_correlations(table: Dataset) -> list[str]:
     """Notes on the table, one line each."""
     differ = int((table[variables.CORRELATION_P_FALSE_DISCOVERY] < 0.05).sum())
     line = f"{differ} of {table.sizes['pair']} pairs are correlated (false discovery rate 5 %)"
-    return [f"{line} in the region {table.attrs['region']}", *table.attrs["flags"]]
+    return [line, *table.attrs["flags"]]
 
 
 def plot_correlations(table: Dataset, *, ax: Axes | None = None) -> Axes:
@@ -240,11 +220,6 @@ def plot_correlations(table: Dataset, *, ax: Axes | None = None) -> Axes:
         "at a false discovery rate of 5 %"
     )
     return ax
-
-
-def tabulate_correlations(table: Dataset) -> Table:
-    """Header and one row per pair."""
-    return table_of(table, COLUMNS, ["pair"])
 
 
 @dataclass(frozen=True)
@@ -272,7 +247,7 @@ STUDY = Study(
     parameters=Parameters,
     compute=compute,
     shown=("correlations",),
-    tabulate=tabulate_correlations,
+    tabulate=lambda table: table_of(table, COLUMNS),
     plot=plot_correlations,
     describe=describe_correlations,
     compares_normal=True,

@@ -300,7 +300,7 @@ STUDY = Study(
     parameters=Parameters,
     compute=compute,
     shown=("coverage",),
-    tabulate=lambda report: table_of(report, [variables.COVERAGE_COUNT], ["cell"]),
+    tabulate=lambda report: table_of(report, [variables.COVERAGE_COUNT]),
     plot=plot_coverage,
     describe=describe_coverage,
 )

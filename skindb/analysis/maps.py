@@ -258,7 +258,7 @@ def tabulate_effect_maps(maps: Dataset) -> Table:
         "mean_effect": effect.mean(texel),
         "largest_effect": high.where(high >= -low, low),
     }
-    return table_of(maps.assign(columns), list(columns), ("contrast", "quantity"))
+    return table_of(maps.assign(columns), list(columns))
 
 
 def describe_effect_maps(maps: Dataset) -> list[str]:

@@ -192,8 +192,13 @@ class Study:
         return self.uses_registration or self.layout == "maps"
 
 
-def table_of(table: Dataset, names: Sequence[str], dims: Sequence[str]) -> Table:
-    """Header and rows of variables with the same dims, one row per element."""
+def table_of(
+    table: Dataset, names: Sequence[str], dims: Sequence[str] | None = None
+) -> Table:
+    """Header and rows of variables with the same dims, by default those of the first, one
+    row per element.
+    """
+    dims = dims or [str(dim) for dim in table[names[0]].dims]
     stacked = table[list(names)].stack(row=dims, create_index=False)
     columns = [stacked[name].values.tolist() for name in names]
     keys = itertools.product(*(table[dim].values.tolist() for dim in dims))

@@ -126,14 +126,12 @@ def region_tables(fitted: Dataset, masks: Mapping[str, Mask]) -> Dataset:
     area = fitted[variables.SURFEL_AREA].values.astype(float)
     colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(float)
     noise, total, shine, shine_error = (
-        fitted[name].values.astype(float)
-        if name in fitted
-        else np.full((len(area), *shape), np.nan)
+        fitted[name].values.astype(float) if name in fitted else np.full(shape, np.nan)
         for name, shape in (
-            (variables.DIFFUSE_REFLECTANCE_ERROR, (3,)),
-            (variables.DIFFUSE_REFLECTANCE_TOTAL_ERROR, (3,)),
-            (variables.SURFACE_REFLECTANCE, ()),
-            (variables.SURFACE_REFLECTANCE_ERROR, ()),
+            (variables.DIFFUSE_REFLECTANCE_ERROR, colour.shape),
+            (variables.DIFFUSE_REFLECTANCE_TOTAL_ERROR, colour.shape),
+            (variables.SURFACE_REFLECTANCE, area.shape),
+            (variables.SURFACE_REFLECTANCE_ERROR, area.shape),
         )
     )
     # model errors of neighbouring surfels are correlated: averaging does not reduce them

@@ -395,7 +395,7 @@ def tabulate_brdf_space(space: Dataset) -> Table:
         )
         for side in SIDES
     }
-    return table_of(space.assign(counts), [*counts, *COLUMNS], ["pair"])
+    return table_of(space.assign(counts), [*counts, *COLUMNS])
 
 
 def describe_brdf_space(space: Dataset) -> list[str]:

@@ -407,7 +407,7 @@ def tabulate_traits(traits: Dataset) -> Table:
                 dims = [dim for dim in face[part].dims if dim != "trait"]
                 square = (face[part] ** 2).mean(dims, skipna=False)
                 columns[f"{name}_{column}"] = square**0.5
-    return table_of(traits.assign(columns), list(columns), ["trait"])
+    return table_of(traits.assign(columns), list(columns))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from xarray import Dataset
 from skindb import plots
 from skindb.analysis.contrasts import FEW
 from skindb.analysis.quantities import trusted
-from skindb.analysis.study import Population, Results, Study, Table, table_of
+from skindb.analysis.study import Population, Results, Study, table_of
 from skindb.analysis.subjects import Groups, grouped
 from skindb.numerics.statistics import SUMMARY, known_mean, variance_components
 from skindb.parameters import group_option
@@ -113,14 +113,10 @@ def describe_translucency(table: Dataset) -> list[str]:
     """Statuses of the profiles, and groups whose intervals depend on an assumption, one
     line each.
     """
-    statuses = ", ".join(
-        f"{count} {name}" for name, count in table.attrs.get("statuses", {}).items()
-    )
-    lines = (
-        [f"status of the profiles: {statuses}; only fitted and poor_fit are used"]
-        if statuses
-        else []
-    )
+    lines = []
+    if counts := table.attrs.get("statuses"):
+        words = ", ".join(f"{count} {name}" for name, count in counts.items())
+        lines = [f"status of the profiles: {words}; only fitted and poor_fit are used"]
     for group in map(str, table["group"].values):
         count = table[variables.SIGMA_TR_COUNT].sel(group=group).values
         if count.size and 0 < (largest := int(count.max())) < FEW:
@@ -134,18 +130,16 @@ def describe_translucency(table: Dataset) -> list[str]:
 
 
 def _statuses(takes: Dataset) -> dict[str, int]:
-    """Number of profiles of each status."""
+    """Number of profiles of each status that occurs."""
     if variables.SITE_STATUS not in takes:
         return {}
     statuses = takes[variables.SITE_STATUS].values
     counts = {
-        member.name.lower(): int((statuses == member).sum()) for member in ProbeStatus
+        member.name.lower(): int((statuses == member).sum())
+        for member in ProbeStatus
+        if member != ProbeStatus.NOT_MEASURED
     }
-    return {
-        name: count
-        for name, count in counts.items()
-        if count and name != ProbeStatus.NOT_MEASURED.name.lower()
-    }
+    return {name: count for name, count in counts.items() if count}
 
 
 def _repeat_deviation(values: Array, subjects: NDArray[np.str_]) -> Array:
@@ -197,12 +191,6 @@ def plot_translucency(table: Dataset, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def tabulate_translucency(table: Dataset) -> Table:
-    """Header and one row per group, site and channel."""
-    names = [name for name in COLUMNS if name in table]
-    return table_of(table, names, ("group", "site", "channel"))
-
-
 @dataclass(frozen=True)
 class Parameters:
     """Parameters of the study of translucency."""
@@ -212,10 +200,7 @@ class Parameters:
 
 def compute(population: Population, parameters: Parameters) -> Results:
     """The results of the study."""
-    table = translucency_table(
-        population.cohort,
-        group_by=parameters.group_by,
-    )
+    table = translucency_table(population.cohort, group_by=parameters.group_by)
     return {"translucency_table": table}
 
 
@@ -226,7 +211,7 @@ STUDY = Study(
     parameters=Parameters,
     compute=compute,
     shown=("translucency_table",),
-    tabulate=tabulate_translucency,
+    tabulate=lambda table: table_of(table, COLUMNS),
     plot=plot_translucency,
     describe=describe_translucency,
     columns_of_files=(
