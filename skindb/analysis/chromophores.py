@@ -42,7 +42,7 @@ from skindb.analysis.texture import (
     MAPPED,
     covered_fractions,
 )
-from skindb.errors import input_error, require
+from skindb.errors import require
 from skindb.numerics.statistics import SUMMARY, Moments
 from skindb.parameters import group_option, seed_option
 from skindb.schema import dataset, variables
@@ -207,14 +207,14 @@ def _skin_samples(cohort: Dataset, inside: Mask, count: int) -> list[_Sampled]:
         "none",
         "fit or register more takes",
     )
-    density = np.concatenate([sample.density for sample in samples])
-    if density.var(axis=0).sum() <= CONSTANT:
-        raise input_error(
-            "chromophores",
-            "albedo must vary over the skin of a take",
-            "constant maps",
-            "use maps of measured faces",
-        )
+    require(
+        np.concatenate([sample.density for sample in samples]).var(axis=0).sum()
+        > CONSTANT,
+        "chromophores",
+        "albedo must vary over the skin of a take",
+        "constant maps",
+        "use maps of measured faces",
+    )
     return samples
 
 
@@ -422,32 +422,24 @@ def _rejection_reasons(mixing: Array, spread: Array, plane: _Plane) -> list[str]
     """Reasons why components cannot be the absorption of two pigments; empty if there are none."""
     if not np.isfinite(mixing).all():
         return ["albedo varies in one direction only, as with one pigment"]
-    reasons = []
     ratio = plane.variance[1] / max(plane.variance[2], 1e-300)
-    if ratio < MIN_PLANE_RATIO:
-        reasons.append(
-            f"the second principal variance is {ratio:.2f} times the third, as "
-            "with one pigment and noise"
-        )
-    if spread.max() > MAX_AXIS_SPREAD:
-        reasons.append(
-            f"they rotate by {spread.max():.0f} degrees between samples, as with "
-            "normally distributed pigments"
-        )
-    if mixing.min() < -MAX_NEGATIVE:
-        channel = CHANNELS[int(np.argmin(mixing.min(axis=0)))]
-        reasons.append(f"one of them would brighten {channel}, which no pigment does")
-    angle = _angle(mixing, TABLE_AXES)
-    for name, is_far, value in zip(
-        CHROMOPHORES, angle > MAX_TABLE_ANGLE, angle, strict=True
-    ):
-        if is_far:
-            reasons.append(
-                f"the axis of {name} is {value:.0f} degrees from published absorption"
-            )
-    if (apart := float(_angle(mixing[:1], mixing[1:])[0])) < MIN_SEPARATION:
-        reasons.append(f"they are {apart:.1f} degrees apart")
-    return reasons
+    negative = CHANNELS[int(np.argmin(mixing.min(axis=0)))]
+    apart = float(_angle(mixing[:1], mixing[1:])[0])
+    reasons = {
+        f"the second principal variance is {ratio:.2f} times the third, as with one "
+        "pigment and noise": ratio < MIN_PLANE_RATIO,
+        f"they rotate by {spread.max():.0f} degrees between samples, as with normally "
+        "distributed pigments": spread.max() > MAX_AXIS_SPREAD,
+        f"one of them would brighten {negative}, which no pigment does": (
+            mixing.min() < -MAX_NEGATIVE
+        ),
+    }
+    angles = _angle(mixing, TABLE_AXES)
+    for name, angle, limit in zip(CHROMOPHORES, angles, MAX_TABLE_ANGLE, strict=True):
+        text = f"the axis of {name} is {angle:.0f} degrees from published absorption"
+        reasons[text] = angle > limit
+    reasons[f"they are {apart:.1f} degrees apart"] = apart < MIN_SEPARATION
+    return [text for text, applies in reasons.items() if applies]
 
 
 def _published_axes(plane: _Plane) -> tuple[Array, str]:
@@ -505,21 +497,15 @@ def describe_chromophores(axes: Dataset) -> list[str]:
     lines = [f"axes: {axes.attrs['axes_origin']}"]
     for name in CHROMOPHORES:
         axis = axes.sel(chromophore=name)
-        vector = ", ".join(
-            f"{value:.2f}" for value in axis[variables.CHROMOPHORE_AXIS].values
-        )
+        absorbed = axis[variables.CHROMOPHORE_AXIS].values.tolist()
         lines.append(
-            f"{name}: absorbs R, G, B as {vector}; "
+            f"{name}: absorbs R, G, B as {', '.join(f'{x:.2f}' for x in absorbed)}; "
             f"{float(axis[variables.CHROMOPHORE_TABLE_ANGLE]):.0f} degrees from "
             f"published absorption; independent components rotate by "
-            f"{float(axis[variables.CHROMOPHORE_AXIS_SPREAD]):.1f} degrees "
-            "between samples"
+            f"{float(axis[variables.CHROMOPHORE_AXIS_SPREAD]):.1f} degrees between samples"
         )
-    lines.append(
-        "amounts are optical densities (-ln R_d) of a pigment at green, relative "
-        "to the mean of all takes"
-    )
-    return [*lines, *axes.attrs["flags"]]
+    amounts = "amounts are optical densities (-ln R_d) of a pigment at green, relative "
+    return [*lines, f"{amounts}to the mean of all takes", *axes.attrs["flags"]]
 
 
 def plot_chromophores(table: Dataset, *, ax: Axes | None = None) -> Axes:

@@ -12,7 +12,7 @@ from skindb.analysis.edit import surviving, with_albedo
 from skindb.analysis.regions import common_landmarks, map_regions
 from skindb.analysis.summary import common_maps
 from skindb.analysis.texture import SIZE, at_surfels, log_albedo
-from skindb.errors import input_error, require
+from skindb.errors import require
 from skindb.numerics.texture import Image, build, level_fractions, reconstruct
 from skindb.schema import variables
 from skindb.schema.consent import honour_consent
@@ -70,7 +70,15 @@ def transfer_detail(
     """
     for take in (model, source):
         honour_consent(take.attrs, "statistics")
-    _require_same_landmarks(registered, source_registered)
+    require(
+        np.array_equal(
+            registered["landmark"].values, source_registered["landmark"].values
+        ),
+        "transfer of detail",
+        "both takes must be registered together",
+        "different sets of landmarks",
+        "run skindb register",
+    )
     per_texel = float(registered[variables.MM_PER_UV]) / size
     levels = _transferred_levels(coarsest, per_texel, size)
     maps, source_maps = (
@@ -83,19 +91,15 @@ def transfer_detail(
     fraction = np.asarray(mask & is_measured, np.float32)
     # 0 where the source was not measured
     fraction = gaussian_filter(fraction, EDGE / per_texel) * fraction
-    change = np.stack(
-        [
-            _detail_change(log[..., c], log_source[..., c], fraction, levels)
-            for c in range(3)
-        ],
-        axis=-1,
-    )
+    changes = [
+        _detail_change(log[..., c], log_source[..., c], fraction, levels)
+        for c in range(3)
+    ]
+    change = np.stack(changes, axis=-1)
     fitted = model["fitted"].to_dataset().load()
     colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(float)
-    moved = with_albedo(
-        fitted,
-        colour * np.exp(at_surfels(change, registered[variables.COMMON_UV].values)),
-    )
+    factor = np.exp(at_surfels(change, registered[variables.COMMON_UV].values))
+    moved = with_albedo(fitted, colour * factor)
     tree = model.copy()
     tree["fitted"] = DataTree(surviving(moved))
     edited = {
@@ -105,17 +109,6 @@ def transfer_detail(
     }
     tree.attrs = take_attrs(model.attrs) | {"edit": edited}
     return tree
-
-
-def _require_same_landmarks(registered: Dataset, source: Dataset) -> None:
-    """Raise `InputError` if two takes were not registered together."""
-    require(
-        np.array_equal(registered["landmark"].values, source["landmark"].values),
-        "transfer of detail",
-        "both takes must be registered together",
-        "different sets of landmarks",
-        "run skindb register",
-    )
 
 
 def _transferred_levels(coarsest: float, per_texel: float, size: int) -> int:
@@ -128,13 +121,13 @@ def _transferred_levels(coarsest: float, per_texel: float, size: int) -> int:
     """
     levels = math.floor(math.log2(coarsest / per_texel)) - 1 if coarsest > 0 else 0
     levels = min(levels, size.bit_length() - 2)
-    if levels < 1:
-        raise input_error(
-            "coarsest",
-            f"must be at least four texels of {per_texel:.2g} mm",
-            f"{coarsest:g} mm",
-            "choose a larger wavelength or more texels",
-        )
+    require(
+        levels >= 1,
+        "coarsest",
+        f"must be at least four texels of {per_texel:.2g} mm",
+        f"{coarsest:g} mm",
+        "choose a larger wavelength or more texels",
+    )
     return levels
 
 
@@ -164,11 +157,11 @@ def _region(
         return mask
     landmarks = common_landmarks({"own": registered, "other": source_registered})
     drawn = map_regions(landmarks, size)
-    if region not in drawn:
-        raise input_error(
-            f"region {region}",
-            "must be a region defined by the landmarks",
-            "an unknown name",
-            f"choose one of {', '.join(drawn)}",
-        )
+    require(
+        region in drawn,
+        f"region {region}",
+        "must be a region defined by the landmarks",
+        "an unknown name",
+        f"choose one of {', '.join(drawn)}",
+    )
     return drawn[region]

@@ -30,7 +30,7 @@ from skindb.analysis.study import (
     table_of,
 )
 from skindb.analysis.subjects import notes_on_attributes, subjects_of
-from skindb.errors import Fault, InputError, input_error, require
+from skindb.errors import Fault, InputError, require
 from skindb.parameters import ContrastParameters, permutations_option
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
@@ -60,7 +60,6 @@ def effect_maps(
     quantities: Sequence[str] = (),
     size: int = SIZE,
     permutations: int = PERMUTATIONS,
-    min_fraction: float = MIN_FRACTION,
     rng: np.random.Generator,
 ) -> Dataset:
     """Effect of an attribute on albedo, surface reflectance and log sigma_tr at every
@@ -82,15 +81,14 @@ def effect_maps(
         Texels along each side; it must divide the size of the maps of the cohort.
     permutations
         Maximum number of permutations; the smallest p value is 1 / (permutations + 1).
-    min_fraction
-        Minimum fraction of the subjects that must have a value at a texel; other texels are NaN.
 
     Returns
     -------
     Dataset
         (contrast, quantity, v, u) `map_effect`, `map_effect_half_width` of its 95 %
         interval, `map_effect_p` of the single texel, `map_effect_p_adjusted`, and
-        `map_effect_count`, the number of subjects.
+        `map_effect_count`, the number of subjects; NaN at texels that less than 80 % of
+        the subjects have.
 
     Raises
     ------
@@ -99,14 +97,21 @@ def effect_maps(
     """
     require_comparable(cohort, "maps")
     adjust = (adjust,) if isinstance(adjust, str) else tuple(adjust)
-    _require_divisor(size, cohort.sizes["v"])
+    texels = cohort.sizes["v"]
+    require(
+        size > 0 and texels % size == 0,
+        "size",
+        f"must divide the {texels} texels of the maps",
+        str(size),
+        f"choose {texels}, {texels // 2} or {texels // 4}",
+    )
     compare = partial(
         compare_groups,
         cohort,
         group_by,
         adjust,
         permutations=permutations,
-        min_fraction=min_fraction,
+        min_fraction=MIN_FRACTION,
         rng=rng,
     )
     parts, flags, faults = _quantity_maps(
@@ -191,17 +196,6 @@ def _arranged(compared: Sequence[Comparison], quantity: Quantity, size: int) -> 
     )
 
 
-def _require_divisor(size: int, texels: int) -> None:
-    """Raise `InputError` if maps of `texels` cannot be averaged to `size` texels."""
-    if size < 1 or texels % size:
-        raise input_error(
-            "size",
-            f"must divide the {texels} texels of the maps",
-            str(size),
-            f"choose {texels}, {texels // 2} or {texels // 4}",
-        )
-
-
 def _texel_quantities(takes: Dataset, *, quantity: Quantity, size: int) -> Quantities:
     """Values of a quantity at every texel (and channel) of every take, as quantities."""
     require(
@@ -221,9 +215,8 @@ def _block_means(take: Dataset, quantity: Quantity, size: int) -> Array:
     where too few were measured.
     """
     values = take[quantity.mapped].values.astype(float)
-    size_of_maps = values.shape[:2]
-    values = quantity.compared(values.reshape(*size_of_maps, -1))
-    values = values.reshape(*size_of_maps, -1)
+    texels = values.shape[:2]
+    values = quantity.compared(values.reshape(*texels, -1)).reshape(*texels, -1)
     is_known = finite_rows(values)
     weight = np.where(is_known, take[variables.TEXEL_COVERAGE].values, 0.0)[..., None]
     block = len(values) // size
@@ -241,20 +234,15 @@ def tabulate_effect_maps(maps: Dataset) -> Table:
     """
     texel = ("v", "u")
     is_known = maps[variables.MAP_EFFECT_P].notnull()
-    count, effect, p = (
-        maps[name].where(is_known).astype(float)
-        for name in (
-            variables.MAP_EFFECT_COUNT,
-            variables.MAP_EFFECT,
-            variables.MAP_EFFECT_P_ADJUSTED,
-        )
-    )
+    effect = maps[variables.MAP_EFFECT].where(is_known).astype(float)
+    differs = maps[variables.MAP_EFFECT_P_ADJUSTED] < SIGNIFICANT
+    count = maps[variables.MAP_EFFECT_COUNT].where(is_known, 0)
     low = effect.min(texel)
     high = effect.max(texel)
     columns = {
-        "subjects": count.max(texel).fillna(0).astype(int),
+        "subjects": count.max(texel).astype(int),
         "texels": is_known.sum(texel),
-        "fraction_that_differs": (p < SIGNIFICANT).where(is_known).mean(texel),
+        "fraction_that_differs": differs.where(is_known).mean(texel),
         "mean_effect": effect.mean(texel),
         "largest_effect": high.where(high >= -low, low),
     }
@@ -296,11 +284,14 @@ def plot_effect_maps(maps: Dataset, *, contrast: str | None = None) -> Figure:
     figure, axes = pyplot.subplots(
         len(quantities), 3, figsize=(9, 2.9 * len(quantities)), squeeze=False
     )
-    rows, columns = _finite_extent(
-        part[variables.MAP_EFFECT_P].sel(quantity=quantities).values
+    known = (
+        part[variables.MAP_EFFECT_P].sel(quantity=quantities).notnull().any("quantity")
     )
+    for dim, other in (("v", "u"), ("u", "v")):
+        places = np.flatnonzero(known.any(other))
+        part = part.isel({dim: slice(places[0], places[-1] + 1)})
     for line, quantity in zip(axes, quantities, strict=True):
-        _plot_quantity(line, part.sel(quantity=quantity).isel(v=rows, u=columns))
+        _plot_quantity(line, part.sel(quantity=quantity))
     adjusted = ", ".join(maps.attrs["adjust"])
     note = f", adjusted for {adjusted}" if adjusted else ""
     figure.suptitle(f"{name}{note}; lines surround adjusted p < 0.05", fontsize=9)
@@ -340,15 +331,6 @@ def _plot_quantity(line: Sequence[Axes], maps: Dataset) -> None:
     differ = maps[variables.MAP_EFFECT_P_ADJUSTED].values < SIGNIFICANT
     if differ.any() and not differ.all():
         line[0].contour(differ, levels=[0.5], colors="black", linewidths=0.6)
-
-
-def _finite_extent(values: Array) -> tuple[slice, slice]:
-    """Slices of the rows and columns that contain the finite values of an array (..., v, u)."""
-    places = np.argwhere(np.isfinite(values).any(axis=0))
-    if not len(places):
-        return slice(None), slice(None)
-    rows, columns = np.stack([places.min(axis=0), places.max(axis=0) + 1], axis=1)
-    return slice(*rows), slice(*columns)
 
 
 @dataclass(frozen=True)

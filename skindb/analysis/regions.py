@@ -87,13 +87,16 @@ def common_landmarks(registered: Mapping[str, Dataset]) -> dict[str, Array]:
     """
     places: dict[str, list[Array]] = {}
     for take in registered.values():
-        names = map(str, take["landmark"].values)
-        for name, place in zip(
-            names, take[variables.COMMON_LANDMARK].values, strict=True
-        ):
+        for name, place in _landmarks(take).items():
             if np.isfinite(place).all():
                 places.setdefault(name, []).append(place)
     return {name: np.mean(points, axis=0) for name, points in places.items()}
+
+
+def _landmarks(registered: Dataset) -> dict[str, Array]:
+    """Positions (2,) of the landmarks of a take in the common (u, v)."""
+    points = registered[variables.COMMON_LANDMARK].values
+    return dict(zip(map(str, registered["landmark"].values), points, strict=True))
 
 
 def own_masks(fitted: Dataset) -> dict[str, Mask]:
@@ -111,12 +114,8 @@ def landmark_masks(registered: Dataset | None) -> dict[str, Mask]:
     """
     if registered is None:
         return {}
-    points = registered[variables.COMMON_LANDMARK]
-    named = {
-        str(name): points.sel(landmark=name).values
-        for name in points["landmark"].values
-    }
-    return region_masks(registered[variables.COMMON_UV].values, named)
+    uv = registered[variables.COMMON_UV].values
+    return region_masks(uv, _landmarks(registered))
 
 
 def take_masks(model: DataTree, registered: Dataset | None = None) -> dict[str, Mask]:
@@ -146,31 +145,25 @@ def _region_mask(name: str, uv: Array, landmarks: Mapping[str, Array]) -> Mask |
     middle = _outlines()["middle"].get(name)
     outline = middle or _outlines()["side"][name]
     try:
-        right = _corners(outline, landmarks, mirror=False)
-        left_side = _corners(outline, landmarks, mirror=True)
+        sides = [_corners(outline, landmarks, mirror) for mirror in (False, True)]
     except KeyError:
         return None
     if middle:
-        both = np.concatenate([right, left_side[::-1]])
-        return np.asarray(points_in_poly(uv, both))
-    return np.asarray(points_in_poly(uv, right) | points_in_poly(uv, left_side))
+        right, left = sides
+        sides = [np.concatenate([right, left[::-1]])]
+    return np.asarray(np.any([points_in_poly(uv, side) for side in sides], axis=0))
 
 
 def _corners(
-    outline: list[Corner], landmarks: Mapping[str, Array], *, mirror: bool
+    outline: list[Corner], landmarks: Mapping[str, Array], mirror: bool
 ) -> Array:
     """Corners (m, 2) of an outline on the subject's right side, or mirrored to the left."""
     across = landmarks["eye_outer_left"] - landmarks["eye_outer_right"]
     down = landmarks["chin"] - landmarks["nasion"]
-    if mirror:
-        across = -across
-        outline = [
-            (name.replace("_right", "_left"), sideways, below)
-            for name, sideways, below in outline
-        ]
-    return np.array(
-        [
-            landmarks[name] + sideways * across + below * down
-            for name, sideways, below in outline
-        ]
-    )
+    corners = []
+    for name, sideways, below in outline:
+        place = landmarks[name.replace("_right", "_left") if mirror else name]
+        corners.append(
+            place + (-sideways if mirror else sideways) * across + below * down
+        )
+    return np.array(corners)

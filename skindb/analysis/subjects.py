@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from xarray import Dataset
 
-from skindb.errors import Fault, InputError, input_error
+from skindb.errors import Fault, InputError, input_error, require
 from skindb.numerics.statistics import Moments, known_mean
 from skindb.schema.notes import Note, note
 from skindb.types import Array, Mask
@@ -112,10 +112,10 @@ class Attribute:
             if len(same) > 1:
                 alike = " and ".join(map(repr, sorted(same)))
                 notes.append(f"{self.name}: {alike} count as different values")
-        ages = [] if self.name != AGE else self.known
-        odd = {str(age) for age in ages if _is_finite(age) and not is_age(age)}
+        ages = [value for value in self.known if self.name == AGE and _is_finite(value)]
+        odd = sorted({str(a) for a in ages if not 0 <= float(str(a)) <= MAX_AGE})
         if odd:
-            examples = ", ".join(sorted(odd)[:3])
+            examples = ", ".join(odd[:3])
             rule = f"must be in years, from 0 to {MAX_AGE}"
             notes.append(f"{AGE}: {rule}; found {examples}")
         return notes
@@ -209,13 +209,13 @@ def takes_to_compare(cohort: Dataset, group_by: str | None) -> tuple[Dataset, Su
     subjects = subjects_of(cohort)
     compared = group_by is not None and attribute_of(subjects, group_by) == CONDITION
     rows = np.flatnonzero(subjects.is_normal | compared)
-    if not rows.size:
-        raise input_error(
-            "population",
-            "groups must have a take in the condition normal",
-            f"only {', '.join(subjects.take)}",
-            "group by condition, or add takes in the condition normal",
-        )
+    require(
+        rows.size,
+        "population",
+        "groups must have a take in the condition normal",
+        f"only {', '.join(subjects.take)}",
+        "group by condition, or add takes in the condition normal",
+    )
     return cohort.isel(take=rows), subjects.select(rows)
 
 
@@ -294,16 +294,14 @@ def groups_by(subjects: Subjects, name: str | None) -> list[str]:
         values = subjects.attributes[name].values
         return [UNKNOWN if value is None else word_of(value) for value in values]
     trait = trait_of(subjects, name)
-    carries = has_trait(subjects, trait)
+    lacks = has_attribute(subjects, trait)
+    rest = UNKNOWN
     if trait.startswith(f"{CONDITION}:"):
         # only takes in the condition normal count as without it
         lacks = subjects.is_normal
         rest = OTHER
-    else:
-        lacks = has_attribute(subjects, trait)
-        rest = UNKNOWN
-    names = np.select([carries, lacks], [trait, f"not {trait}"], rest)
-    return [str(name) for name in names]
+    sides = [has_trait(subjects, trait), lacks]
+    return [*map(str, np.select(sides, [trait, f"not {trait}"], rest))]
 
 
 def attribute_of(subjects: Subjects, name: str) -> str:
@@ -490,11 +488,6 @@ def word_of(value: Value) -> str:
     if isinstance(value, float) and value.is_integer():
         return str(int(value))
     return str(value)
-
-
-def is_age(value: Value) -> bool:
-    """Whether a value is an age in years."""
-    return _is_finite(value) and 0 <= float(str(value)) <= MAX_AGE
 
 
 def _parsed(value: object) -> Value:
