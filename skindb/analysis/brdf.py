@@ -25,7 +25,7 @@ from skindb.analysis.study import (
     shared_once,
     skipped_takes,
 )
-from skindb.errors import Fault, InputError, input_error
+from skindb.errors import Fault, InputError, require
 from skindb.numerics.factorise import Sums, nmf, refine
 from skindb.numerics.nnls import solve_nnls
 from skindb.numerics.statistics import bootstrap_interval
@@ -211,16 +211,15 @@ def same_dictionary(cohort: Dataset) -> list[str]:
     dictionaries differ.
     """
     if "fit_dictionary" in cohort.coords:
-        sources = sorted(
-            {str(value) for value in cohort["fit_dictionary"].dropna("take").values}
+        known = cohort["fit_dictionary"].dropna("take").values
+        sources = sorted({str(value) for value in known})
+        require(
+            len(sources) <= 1,
+            "dictionary",
+            "all takes of a population must be fitted with one dictionary",
+            ", ".join(sources),
+            "fit them again with the same dictionary",
         )
-        if len(sources) > 1:
-            raise input_error(
-                "dictionary",
-                "all takes of a population must be fitted with one dictionary",
-                ", ".join(sources),
-                "fit them again with the same dictionary",
-            )
     return [str(name) for name in cohort["dictionary"].values]
 
 

@@ -28,7 +28,7 @@ from skindb.analysis.subjects import (
     trait_of,
     word_of,
 )
-from skindb.errors import Fault, input_error, require
+from skindb.errors import Fault, require
 from skindb.numerics.inference import (
     Effects,
     effects,
@@ -98,13 +98,13 @@ def contrasts(
     everyone = subjects_of(cohort)
     compared = attribute_of(everyone, group_by)
     if compared == CONDITION:
-        if adjust:
-            raise input_error(
-                "adjust",
-                "conditions are compared within subjects, which holds everything else fixed",
-                ", ".join(adjust),
-                "omit this option",
-            )
+        require(
+            not adjust,
+            "adjust",
+            "conditions are compared within subjects, which holds everything else fixed",
+            ", ".join(adjust),
+            "omit this option",
+        )
         return _paired(cohort, group_by, measure)
     require_adjustable(everyone, adjust, compared)
     takes, subjects = takes_to_compare(cohort, group_by)
@@ -149,14 +149,13 @@ def _covariates(
 def _regressors(attribute: Attribute, group_by: str) -> dict[str, Array]:
     """Name of each comparison by an attribute -> regressor (n,), NaN where unknown."""
     words = sorted({word_of(value) for value in attribute.known})
-    if len(words) < 2:
-        finding = f"only {words[0]}" if words else "no subject with this attribute"
-        raise input_error(
-            f"group by {group_by}",
-            "there must be subjects of two groups",
-            finding,
-            "group by another attribute",
-        )
+    require(
+        len(words) >= 2,
+        f"group by {group_by}",
+        "there must be subjects of two groups",
+        f"only {words[0]}" if words else "no subject with this attribute",
+        "group by another attribute",
+    )
     if attribute.is_numeric:
         return {f"{group_by}, per unit": attribute.numbers}
     is_known = np.array([value is not None for value in attribute.values])

@@ -10,7 +10,7 @@ from skindb.analysis.albedo import cumulative, decorrelate, histogram, quantiles
 from skindb.analysis.brdf import project
 from skindb.analysis.subjects import trait_name
 from skindb.analysis.texture import at_surfels, edit_texture
-from skindb.errors import Fault, InputError, input_error
+from skindb.errors import Fault, InputError, require
 from skindb.numerics.texture import quantile_levels, valid_quantiles
 from skindb.optics.diffusion import dipole_s
 from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, stored_brdf
@@ -108,10 +108,14 @@ def apply_traits(
     mixture = basis[variables.POPULATION_MIXTURE].values
     names = basis["dictionary"].values.tolist()
     tree["basis"] = DataTree(_common_basis(model, mixture, names, tables))
-    shift = _texture_shift(amount, traits)
-    if texture is None or maps is None or registered is None or shift is None:
+    has_textures = TEXTURE_SHIFT in traits
+    if texture is None or maps is None or registered is None or not has_textures:
         fitted, reports["albedo"] = _moved_albedo(fitted, amount, traits, albedo)
     else:
+        used = amount != 0
+        shift = np.tensordot(
+            amount[used], float64(traits[TEXTURE_SHIFT].values[used]), 1
+        )
         fitted, reports["albedo"] = _moved_texture(
             fitted, shift, albedo, texture, maps, registered
         )
@@ -155,13 +159,13 @@ def _trait_amounts(amounts: Mapping[str, float], traits: Dataset) -> Array:
             faults += error.faults
     if faults:
         raise InputError(faults)
-    if not (np.abs(total) <= MAX_AMOUNT).all():
-        raise input_error(
-            "amount",
-            f"must be a number from -{MAX_AMOUNT:g} to {MAX_AMOUNT:g}; 1 is the whole difference",
-            str(dict(amounts)),
-            "give a number such as 0.5",
-        )
+    require(
+        (np.abs(total) <= MAX_AMOUNT).all(),
+        "amount",
+        f"must be a number from -{MAX_AMOUNT:g} to {MAX_AMOUNT:g}; 1 is the whole difference",
+        str(dict(amounts)),
+        "give a number such as 0.5",
+    )
     return total
 
 
@@ -251,15 +255,6 @@ def _common_basis(
         coords={"dictionary": names, **brdf_coords(TableGrid(*tables.shape[:3]))},
         attrs={} if source is None else {"dictionary": source},
     )
-
-
-def _texture_shift(amount: Array, traits: Dataset) -> Array | None:
-    """Shift of the quantiles of textures; None if the study has none."""
-    if TEXTURE_SHIFT not in traits:
-        return None
-    is_used = amount != 0
-    shifts = traits[TEXTURE_SHIFT].values[is_used].astype(float)
-    return np.asarray(np.tensordot(amount[is_used], shifts, 1))
 
 
 def _moved_texture(

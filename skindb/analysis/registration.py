@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from xarray import Dataset, DataTree
 
-from skindb.errors import input_error
+from skindb.errors import require
 from skindb.geometry.atlas import signed_areas
 from skindb.geometry.landmarks import mean_shape
 from skindb.geometry.mesh import closest_on_mesh
@@ -148,14 +148,13 @@ def common_frame(
     reference, smoothing
         See `register`.
     """
-    if reference is not None and reference not in outlines:
-        choices = ", ".join(outlines) or "none"
-        raise input_error(
-            f"reference {reference}",
-            "must be a take with landmarks",
-            "another name",
-            f"choose from takes with landmarks: {choices}",
-        )
+    require(
+        reference is None or reference in outlines,
+        f"reference {reference}",
+        "must be a take with landmarks",
+        "another name",
+        f"choose from takes with landmarks: {', '.join(outlines) or 'none'}",
+    )
     if not outlines:
         return None
     names = tuple(dict.fromkeys(n for shape in outlines.values() for n in shape.names))

@@ -37,7 +37,7 @@ from skindb.analysis.subjects import (
     trait_names,
 )
 from skindb.analysis.summary import SAMPLED
-from skindb.errors import Fault, InputError, input_error
+from skindb.errors import Fault, InputError, require
 from skindb.numerics.inference import missing_patterns
 from skindb.numerics.statistics import known_mean
 from skindb.parameters import DICTIONARY_HELP, adjust_option, option, seed_option
@@ -290,14 +290,13 @@ def _units(
     design = np.column_stack([regressor, np.ones(len(names)), *held])
     complete = finite_rows(design)
     design = design[complete]
-    if np.linalg.matrix_rank(design) < np.linalg.matrix_rank(design[:, 1:]) + 1:
-        finding = ", ".join(adjust) or "one value"
-        raise input_error(
-            f"trait {trait}",
-            "must vary independently of the attributes that are adjusted for",
-            finding,
-            "adjust for fewer attributes, or exclude the trait",
-        )
+    require(
+        np.linalg.matrix_rank(design) > np.linalg.matrix_rank(design[:, 1:]),
+        f"trait {trait}",
+        "must vary independently of the attributes that are adjusted for",
+        ", ".join(adjust) or "one value",
+        "adjust for fewer attributes, or exclude the trait",
+    )
     return Units(tuple(itertools.compress(rows, complete)), (), design)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from skindb import workflow
 from skindb.demo.report import PLOTS, VIEWER, Results, write_report
 from skindb.elementwise import thread_count
-from skindb.errors import input_error
+from skindb.errors import require
 from skindb.export.bundle import export_bundle
 from skindb.files import make_private, private_file
 from skindb.fit import compile_kernels
@@ -130,24 +130,22 @@ def _studies(parameters: DemoParameters) -> dict[str, dict[str, Any]]:
 def _remove_earlier_demo(out: Path) -> None:
     """Remove the files of an earlier demo; a folder with other content is refused."""
     mark = out / ".skindb-demo"
-    if out.exists() and any(out.iterdir()) and not mark.exists():
-        raise input_error(
-            str(out),
-            "the folder of the demo must be absent, empty or from an earlier demo",
-            "other files",
-            "choose another --out",
-        )
-    added = sorted(
-        set(Database(out / "db").subjects())
-        - {person.subject for person in default_people()}
+    require(
+        mark.exists() or not out.exists() or not any(out.iterdir()),
+        str(out),
+        "the folder of the demo must be absent, empty or from an earlier demo",
+        "other files",
+        "choose another --out",
     )
-    if added:
-        raise input_error(
-            str(out / "db"),
-            "the database of the demo, which is deleted, must have no other subjects",
-            ", ".join(added),
-            "choose another --out, or move the database",
-        )
+    people = {person.subject for person in default_people()}
+    added = sorted(set(Database(out / "db").subjects()) - people)
+    require(
+        not added,
+        str(out / "db"),
+        "the database of the demo, which is deleted, must have no other subjects",
+        ", ".join(added),
+        "choose another --out, or move the database",
+    )
     for name in ("captures", "db", "export", PLOTS):
         shutil.rmtree(out / name, ignore_errors=True)
     for name in ("report.html", VIEWER):

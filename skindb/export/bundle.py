@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 
 from skindb import __version__
-from skindb.errors import input_error
+from skindb.errors import input_error, require
 from skindb.export.gltf import export_gltf
 from skindb.export.inputs import describe_edit
 from skindb.export.maps import RGB, TextureMap, texture_maps
@@ -162,14 +162,13 @@ def export_bundle(
     require_consent(model.attrs, "export")
     model = as_mixture(model)
     target = Path(out).absolute()  # absolute, as "." has no name
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        content = "files in it" if target.is_dir() else "a file"
-        raise input_error(
-            str(target),
-            "must be a new or empty folder",
-            content,
-            "choose another folder",
-        )
+    require(
+        not target.exists() or (target.is_dir() and not any(target.iterdir())),
+        str(target),
+        "must be a new or empty folder",
+        "files in it" if target.is_dir() else "a file",
+        "choose another folder",
+    )
     staged = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.partial")
     try:
         make_private(staged)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb.errors import input_error
+from skindb.errors import require
 from skindb.files import plain
 from skindb.optics.diffusion import dipole_s
 from skindb.render.surfels import with_matt_surfels
@@ -62,18 +62,16 @@ def chosen_size(model: xr.DataTree, size: int | None) -> int:
         If `size` is not positive, or the maps need more memory than is free.
     """
     side = texture_size(model) if size is None else size
-    if side < 1:
-        raise input_error("size", "must be positive", str(side), "omit it")
+    require(side > 0, "size", "must be positive", str(side), "omit it")
     needed = BYTES_PER_TEXEL * side**2
     free = _free_memory()
-    if needed > free:
-        cure = "choose a smaller size"
-        raise input_error(
-            "size",
-            f"maps of {side} x {side} texels need {needed / 1e9:.1f} GB of memory",
-            f"{free / 1e9:.1f} GB",
-            f"{cure}, for example {texture_size(model)}",
-        )
+    require(
+        needed <= free,
+        "size",
+        f"maps of {side} x {side} texels need {needed / 1e9:.1f} GB of memory",
+        f"{free / 1e9:.1f} GB",
+        f"choose a smaller size, for example {texture_size(model)}",
+    )
     return side
 
 
@@ -101,23 +99,16 @@ def required(model: xr.DataTree) -> xr.Dataset:
     """
     fitted = model["fitted"].to_dataset()
     check(fitted, REQUIRED, where="fitted")
-    corner = (
-        fitted[variables.SURFEL_UV]
-        .values[model["mesh"].to_dataset()[variables.TRIANGLE].values]
-        .astype(float)
+    triangles = model["mesh"].to_dataset()[variables.TRIANGLE].values
+    corner = fitted[variables.SURFEL_UV].values[triangles].astype(float)
+    is_finite = np.isfinite(corner).all()
+    require(
+        is_finite and np.ptp(corner, axis=1).any(),
+        "fitted[surfel_uv]",
+        "texture coordinates must be finite and cover an area",
+        "no triangle with an area" if is_finite else "values that are not finite",
+        "ingest and fit the capture again",
     )
-    if not np.isfinite(corner).all() or not np.ptp(corner, axis=1).any():
-        fault = (
-            "values that are not finite"
-            if not np.isfinite(corner).all()
-            else "no triangle with an area"
-        )
-        raise input_error(
-            "fitted[surfel_uv]",
-            "texture coordinates must be finite and cover an area",
-            fault,
-            "ingest and fit the capture again",
-        )
     return with_matt_surfels(fitted)
 
 

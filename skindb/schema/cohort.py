@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from xarray import Dataset, Variable
 
-from skindb.errors import Fault, InputError, few_names, input_error
+from skindb.errors import Fault, InputError, few_names, require
 from skindb.schema.label import label, text_labels
 from skindb.schema.notes import note
 from skindb.schema.variables import VARIABLES
@@ -228,7 +228,12 @@ def combine(
             extent[dim] = max(extent.get(dim, 0), int(part.sizes[dim]))
     extent |= {dim: size for dim, size in (sizes or {}).items() if dim in extent}
     arrays = {
-        name: _lazy(name, _sources(name, parts, layouts), extent, labels)
+        name: _lazy(
+            name,
+            [part.source if name in part.variables else None for part in parts],
+            extent,
+            labels,
+        )
         for name in chosen
     }
     coords: dict[Hashable, Any] = {
@@ -270,43 +275,34 @@ def one_take_each(cohort: Dataset) -> Dataset:
     A subject who was measured only in other conditions is skipped and named in the
     attribute "skipped".
     """
-    subjects, conditions = (
-        [str(subject) for subject in cohort[name].values.tolist()]
-        for name in ("subject", "condition")
+    takes, subjects, conditions = (
+        [str(word) for word in cohort[name].values.tolist()]
+        for name in (TAKE, "subject", "condition")
     )
     index_by_subject: dict[str, int] = {}
-    order = sorted(
-        range(len(subjects)), key=lambda i: visit_of(str(cohort[TAKE].values[i]))
-    )
-    for i in order:
-        subject, condition = subjects[i], conditions[i]
-        if condition == NORMAL:
-            index_by_subject.setdefault(subject, i)
+    for i in sorted(range(len(takes)), key=lambda i: visit_of(takes[i])):
+        if conditions[i] == NORMAL:
+            index_by_subject.setdefault(subjects[i], i)
     missing = sorted(set(subjects) - set(index_by_subject))
-    lines = [
-        *cohort.attrs.get("skipped", []),
-        *(note(subject, "no take in the condition normal") for subject in missing),
-    ]
-    picked = cohort.isel({TAKE: sorted(index_by_subject.values())}).swap_dims(
-        {TAKE: "subject"}
+    picked = cohort.isel({TAKE: sorted(index_by_subject.values())})
+    return picked.swap_dims({TAKE: "subject"}).assign_attrs(
+        skipped=[
+            *cohort.attrs.get("skipped", []),
+            *(note(subject, "no take in the condition normal") for subject in missing),
+        ]
     )
-    return picked.assign_attrs(skipped=lines)
 
 
 def require_takes(cohort: Dataset, layout: str) -> None:
     """Raise `InputError` if a cohort has no dimension "take", or is not of the layout
     "tables" or "maps".
     """
+    dims = ", ".join(map(str, cohort.dims)) or "none"
     cure = f'use db.cohort("{layout}")'
-    if TAKE not in cohort.dims:
-        dims = ", ".join(map(str, cohort.dims)) or "none"
-        raise input_error(
-            "cohort", "must have the dimension take", f"the dimensions {dims}", cure
-        )
-    if layout == "maps" and "v" not in cohort.dims:
-        raise input_error(
-            "cohort", "must hold maps with the dimensions v and u", "tables", cure
-        )
+    rule = "must have the dimension take"
+    require(TAKE in cohort.dims, "cohort", rule, f"the dimensions {dims}", cure)
+    rule = "must hold maps with the dimensions v and u"
+    require(layout != "maps" or "v" in cohort.dims, "cohort", rule, "tables", cure)
 
 
 def require_comparable(cohort: Dataset, layout: str) -> None:
@@ -323,30 +319,22 @@ def require_same_fit(cohort: Dataset) -> None:
     of 1.3 once made a trait vector seven times as long.
     """
     faults = []
+    takes = cohort[TAKE].values.tolist()
     for name in COMPARED:
-        coordinate = f"fit_{name}"
-        if coordinate not in cohort.coords:
+        if f"fit_{name}" not in cohort.coords:
             continue
-        values = cohort[coordinate].values
         groups: dict[str, list[str]] = {}
         for take, value in zip(
-            cohort[TAKE].values.tolist(), values.tolist(), strict=True
+            takes, cohort[f"fit_{name}"].values.tolist(), strict=True
         ):
             # models of earlier versions do not say all
             if value is not None and value == value and value != "":
                 groups.setdefault(str(value), []).append(str(take))
         if len(groups) > 1:
-            differences = "; ".join(
-                f"{value} of {few_names(takes)}" for value, takes in groups.items()
-            )
-            faults.append(
-                Fault(
-                    f"parameter {name}",
-                    "the takes of a study are fitted with the same parameters",
-                    differences,
-                    "refit them alike, or name the takes that the study is to use",
-                )
-            )
+            rule = "the takes of a study are fitted with the same parameters"
+            finding = "; ".join(f"{v} of {few_names(of)}" for v, of in groups.items())
+            cure = "refit them alike, or name the takes that the study is to use"
+            faults.append(Fault(f"parameter {name}", rule, finding, cure))
     if faults:
         raise InputError(faults)
 
@@ -369,15 +357,6 @@ def _different_layouts(parts: Sequence[Part]) -> list[Part]:
         key = (id(part.variables), id(part.sizes), id(part.labels))
         layouts.setdefault(key, part)
     return [*layouts.values()]
-
-
-def _sources(
-    name: str, parts: Iterable[Part], layouts: Iterable[Part]
-) -> list[Source | None]:
-    """Source of a variable for each part; None if it lacks the variable."""
-    if all(name in part.variables for part in layouts):
-        return [part.source for part in parts]
-    return [part.source if name in part.variables else None for part in parts]
 
 
 def _dims(part: Part, variables: Sequence[str]) -> set[str]:

@@ -92,41 +92,32 @@ def _faults(ds: Dataset, name: str, where: str) -> list[Fault]:
     spec = VARIABLES[name]
     place = f"{where}[{name}]"
     if name not in ds.variables:
-        return [
-            Fault(
-                place,
-                "variable is required",
-                f"only {sorted(map(str, ds.variables)) or 'nothing'}",
-                f"it is {spec.doc}",
-            )
-        ]
-    var = ds[name]
-    faults = []
-    if var.dims != spec.dims:
-        faults.append(
-            Fault(
-                place,
+        available = sorted(map(str, ds.variables)) or "nothing"
+        rule = "variable is required"
+        return [Fault(place, rule, f"only {available}", f"it is {spec.doc}")]
+    variable = ds[name]
+    units = variable.attrs.get("units")
+    return [
+        Fault(place, rule, str(finding), cure)
+        for is_right, rule, finding, cure in (
+            (
+                variable.dims == spec.dims,
                 f"dims must be {spec.dims}",
-                str(var.dims),
+                variable.dims,
                 "transpose or rename them",
-            )
-        )
-    if not np.can_cast(var.dtype, spec.dtype, "same_kind"):
-        faults.append(
-            Fault(
-                place,
+            ),
+            (
+                np.can_cast(variable.dtype, spec.dtype, "same_kind"),
                 f"dtype must be {spec.dtype}",
-                str(var.dtype),
+                variable.dtype,
                 "convert it before the call",
-            )
-        )
-    if var.attrs.get("units") != spec.units:
-        faults.append(
-            Fault(
-                place,
+            ),
+            (
+                units == spec.units,
                 f"units must be {spec.units!r}",
-                repr(var.attrs.get("units")),
+                repr(units),
                 "convert the values, then set attrs['units']",
-            )
+            ),
         )
-    return faults
+        if not is_right
+    ]

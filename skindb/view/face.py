@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 from sklearn.cluster import KMeans
 
-from skindb.errors import input_error
+from skindb.errors import require
 from skindb.geometry.mesh import vertex_areas
 from skindb.optics.diffusion import S_FLOOR
 from skindb.optics.fresnel import boundary_factor
@@ -167,13 +167,13 @@ def face_record(
     honour_consent(model.attrs, "export")
     surface = _surface(model, edited=bool(traits))[0]
     resampled, weights = surface.model.resample(surface.parameters)
-    if (count := weights.shape[1]) > MAX_TABLES:
-        raise input_error(
-            take,
-            f"the viewer needs at most {MAX_TABLES} bases",
-            str(count),
-            f"fit again with --k {MAX_TABLES} or less",
-        )
+    require(
+        weights.shape[1] <= MAX_TABLES,
+        take,
+        f"the viewer needs at most {MAX_TABLES} bases",
+        str(weights.shape[1]),
+        f"fit again with --k {MAX_TABLES} or less",
+    )
     values = _values(surface, weights)
     uv = model["fitted"].to_dataset()[variables.SURFEL_UV].values.astype(np.float32)
     tables = _tables(resampled)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from skindb.errors import Fault, InputError, input_error, require
+from skindb.errors import Fault, InputError, require
 from skindb.format.fields import read_json
 from skindb.format.scan_checks import (
     coincidence_faults,
@@ -133,13 +133,13 @@ def parsed_points(value: Any, file: str) -> dict[str, Float64]:
     InputError
         If the value is not an object, or a position is not three finite numbers.
     """
-    if not isinstance(value, dict):
-        raise input_error(
-            file,
-            "must be a JSON object {name: [x, y, z]}",
-            type(value).__name__,
-            "correct it",
-        )
+    require(
+        isinstance(value, dict),
+        file,
+        "must be a JSON object {name: [x, y, z]}",
+        type(value).__name__,
+        "correct it",
+    )
     rule = "a landmark must be [x, y, z] in mm"
     cure = "correct it, or remove it"
     wrong = [

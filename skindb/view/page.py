@@ -19,7 +19,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from skindb.errors import InputError, input_error, system_fault
+from skindb.errors import InputError, input_error, require, system_fault
 from skindb.files import private_file
 
 SCRIPTS = (
@@ -153,13 +153,13 @@ def write_page(
         If the page would be larger than 30 MB.
     """
     content = index_text([*faces], embedded=True, surroundings=surroundings).encode()
-    if len(content) > MAX_PAGE_BYTES:
-        raise input_error(
-            str(out),
-            f"a page must have at most {MAX_PAGE_BYTES // 1_000_000} MB",
-            f"{len(content) / 1e6:.0f} MB",
-            "name fewer takes, or fit with a larger --spacing",
-        )
+    require(
+        len(content) <= MAX_PAGE_BYTES,
+        str(out),
+        f"a page must have at most {MAX_PAGE_BYTES // 1_000_000} MB",
+        f"{len(content) / 1e6:.0f} MB",
+        "name fewer takes, or fit with a larger --spacing",
+    )
     private_file(out).write_bytes(content)
     return len(content)
 
