@@ -6,6 +6,7 @@ import numpy as np
 import xarray as xr
 from small_face import SIDE, small_face
 
+from skindb.analysis.translucency import COLUMNS
 from skindb.demo.report import Results
 from skindb.render.photographs import Comparison
 from skindb.schema import FitStatus, label
@@ -111,14 +112,9 @@ def _studies(takes: tuple[str, ...]) -> dict[str, xr.DataTree]:
     region = ["face"]
     by_site = ("group", "site", "channel")
     sizes = np.arange(1, 7)
+    stated = {"sigma_tr_count": 6, "sigma_tr_mean_low": 0.8, "sigma_tr_mean_high": 1.2}
     translucency = {
-        name: (by_site, np.full((1, 2, 3), value))
-        for name, value in (
-            ("sigma_tr_count", 6),
-            ("sigma_tr_mean", 1.0),
-            ("sigma_tr_mean_low", 0.8),
-            ("sigma_tr_mean_high", 1.2),
-        )
+        name: (by_site, np.full((1, 2, 3), stated.get(name, 1.0))) for name in COLUMNS
     }
     curve = {
         **{
