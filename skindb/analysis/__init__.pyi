@@ -45,6 +45,7 @@ from .maps import (
     plot_effect_maps,
     tabulate_effect_maps,
 )
+from .planning import describe_plan, plot_plan, sample_sizes
 from .regions import region_masks, take_masks
 from .registration import (
     corresponding_points,
@@ -100,6 +101,7 @@ __all__ = [
     "describe_effect_maps",
     "describe_group_effects",
     "describe_model",
+    "describe_plan",
     "describe_repeatability",
     "describe_study",
     "doubtful_landmarks",
@@ -119,6 +121,7 @@ __all__ = [
     "plot_group_lobes",
     "plot_group_spheres",
     "plot_model",
+    "plot_plan",
     "plot_repeatability",
     "plot_study",
     "plot_traits",
@@ -129,6 +132,7 @@ __all__ = [
     "region_tables",
     "register",
     "repeatability",
+    "sample_sizes",
     "sample_surfels",
     "sides",
     "subjects_of",

@@ -33,7 +33,7 @@ from skindb.numerics.statistics import ROUNDING
 from skindb.parameters import option
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
-from skindb.types import Array
+from skindb.types import Array, Mask
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -262,35 +262,10 @@ def _fit(
     margin: float | None = None,
 ) -> _Fit:
     """Fit a model to the rows of one region and channel, which lack no value."""
-    # takes longer to import than most commands to run
-    from formulaic import model_matrix
-    from formulaic.errors import FormulaicError
-
     subjects = rows[SUBJECT].to_numpy(str)
     people = len(set(subjects))
-    try:
-        design = model_matrix(model.fixed, rows, na_action="raise")
-    except (FormulaicError, ValueError, TypeError, SyntaxError) as broken:
-        raise input_error("formula", "must fit the data", f"{broken}"[:200]) from None
-    x = np.asarray(design, float)
-    is_present = x.any(axis=0)  # levels that this region has
-    x = x[:, is_present]
-    terms = [str(name) for name in design.columns[is_present]]
-    require(terms, "formula", "must have fixed terms", "no fixed term", EXAMPLE)
-    of_slopes = {
-        design.columns[column]
-        for term, columns in design.model_spec.term_indices.items()
-        if not {
-            str(name) for name in design.model_spec.term_variables[term]
-        }.isdisjoint(model.slopes)
-        for column in columns
-    }
-    is_between = np.array(
-        [
-            len({*zip(subjects, column, strict=True)}) == people or term in of_slopes
-            for term, column in zip(terms, x.T, strict=True)
-        ]
-    )
+    x, terms, of_slopes = design_of(model, rows)
+    is_between = is_constant_within(x, subjects) | np.isin(terms, of_slopes)
     within = len(rows) - people - int((~is_between).sum())
     free = np.where(is_between, people - is_between.sum(), within).astype(float)
     if not model.is_mixed:
@@ -346,6 +321,58 @@ def _fit(
     )
 
 
+def design_of(
+    model: MixedModel, rows: pd.DataFrame
+) -> tuple[Array, list[str], list[str]]:
+    """Columns (n, p) of the fixed terms that are not 0 everywhere, the names of these
+    terms, and of those that contain a random slope.
+    """
+    # takes longer to import than most commands to run
+    from formulaic import model_matrix
+    from formulaic.errors import FormulaicError
+
+    try:
+        design = model_matrix(model.fixed, rows, na_action="raise")
+    except (FormulaicError, ValueError, TypeError, SyntaxError) as broken:
+        raise input_error("formula", "must fit the data", f"{broken}"[:200]) from None
+    x = np.asarray(design, float)
+    is_present = x.any(axis=0)  # levels that this region has
+    terms = [str(name) for name in design.columns[is_present]]
+    require(terms, "formula", "must have fixed terms", "no fixed term", EXAMPLE)
+    of_slopes = [
+        str(design.columns[column])
+        for term, columns in design.model_spec.term_indices.items()
+        if not {
+            str(name) for name in design.model_spec.term_variables[term]
+        }.isdisjoint(model.slopes)
+        for column in columns
+    ]
+    return x[:, is_present], terms, of_slopes
+
+
+def is_constant_within(x: Array, subjects: Array) -> Mask:
+    """Whether each column (n, p) is constant within subjects (n,)."""
+    people = len(set(subjects))
+    return np.array(
+        [len({*zip(subjects, column, strict=True)}) == people for column in x.T]
+    )
+
+
+def information_of(
+    x: Array, random: Array, subjects: Array, between: Array, variance: float
+) -> Array:
+    """Inverse covariance (p, p) of the fixed effects of columns x (n, p) for columns
+    random (n, q), their covariance between subjects (q, q), and a residual variance.
+    """
+    information = np.zeros((x.shape[1],) * 2)
+    for subject in dict.fromkeys(subjects.tolist()):
+        rows = subjects == subject
+        covariance = random[rows] @ between @ random[rows].T
+        covariance += variance * np.eye(len(covariance))
+        information += x[rows].T @ np.linalg.solve(covariance, x[rows])
+    return information
+
+
 def _inference(
     fitted: tuple[Array, Array, Array],
     terms: Sequence[str],
@@ -354,9 +381,7 @@ def _inference(
 ) -> pd.DataFrame:
     """Variables of terms and contrasts, from estimates, covariance and degrees of freedom."""
     estimate, covariance, free = fitted
-    sums = np.vstack(
-        [np.eye(len(terms)), *(_sum_of(name, terms) for name in contrasts)]
-    )
+    sums = np.vstack([np.eye(len(terms)), *(sum_of(name, terms) for name in contrasts)])
     estimate = sums @ estimate
     error = np.sqrt(np.einsum("ij,jk,ik->i", sums, covariance, sums))
     free = np.where(sums != 0, free, np.inf).min(axis=1)
@@ -376,7 +401,7 @@ def _inference(
     return pd.DataFrame(columns, [*terms, *contrasts])
 
 
-def _sum_of(contrast: str, terms: Sequence[str]) -> Array:
+def sum_of(contrast: str, terms: Sequence[str]) -> Array:
     """Factors (terms,) of the terms in a contrast."""
     from patsy import DesignInfo, PatsyError
 
@@ -429,12 +454,7 @@ def _solve(
         fitted = MixedLM(y, x, groups=subjects, exog_re=random).fit(method="powell")
     variance = float(fitted.scale)
     between = np.atleast_2d(np.asarray(fitted.cov_re, float))
-    information = np.zeros((x.shape[1],) * 2)
-    for subject in dict.fromkeys(subjects.tolist()):
-        rows = subjects == subject
-        covariance = random[rows] @ between @ random[rows].T
-        covariance += variance * np.eye(len(covariance))
-        information += x[rows].T @ np.linalg.solve(covariance, x[rows])
+    information = information_of(x, random, subjects, between, variance)
     between = back_random @ between @ back_random.T
     spread = np.sqrt([*np.maximum(np.diag(between), 0), variance])
     estimate = back @ np.asarray(fitted.fe_params, float)

@@ -13,6 +13,7 @@ from skindb.analysis.coverage import STUDY as COVERAGE
 from skindb.analysis.formula_models import STUDY as MODEL
 from skindb.analysis.groups import STUDY as GROUPS
 from skindb.analysis.maps import STUDY as MAPS
+from skindb.analysis.planning import STUDY as PLAN
 from skindb.analysis.repeats import STUDY as REPEATABILITY
 from skindb.analysis.study import Study, Table
 from skindb.analysis.surface import STUDY as SURFACE
@@ -37,6 +38,7 @@ STUDIES: dict[str, Study] = {
         SURFACE,
         REPEATABILITY,
         MODEL,
+        PLAN,
     )
 }
 

@@ -198,10 +198,9 @@ def _study_command(study: Declaration) -> click.Command:
     studying = click.command(study.name, help=f"Study the {study.description}.")(run)
     if study.name == "translucency":
         studying.params += FACES
-    if study.name == "model":
-        formula = click.Argument(["formula"])
-        options = [option for option in studying.params if option.name != "formula"]
-        studying.params = [formula, *options]
+    options = [option for option in studying.params if option.name != "formula"]
+    if len(options) < len(studying.params):
+        studying.params = [click.Argument(["formula"]), *options]
     return studying
 
 

@@ -416,6 +416,28 @@ MODEL_SUBJECTS = declare(
     "subjects of these takes",
 )
 
+# plan
+PLAN_SUBJECTS = declare(
+    "float64 plan/plan_subjects(quantity) [1]",
+    "subjects in total with which the effect is found",
+)
+PLAN_ERROR = declare(
+    "float64 plan/plan_error(quantity) [1]",
+    "standard error of the term with as many subjects, in the unit of the quantity",
+)
+PLAN_BETWEEN = declare(
+    "float64 plan/between_subject_deviation(quantity) [1]",
+    "standard deviation between subjects, from repeated takes",
+)
+PLAN_WITHIN = declare(
+    "float64 plan/residual_deviation(quantity) [1]",
+    "standard deviation between takes of a subject",
+)
+PLAN_KNOWN = declare(
+    "int32 plan/known_subjects(quantity) [1]",
+    "subjects from whose takes the deviations come",
+)
+
 # repeatability
 REPEAT_SUBJECTS = declare(
     "int32 repeatability/repeat_subjects(quantity) [1]",

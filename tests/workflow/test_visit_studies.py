@@ -73,3 +73,14 @@ def test_analyze_model__is_a_stored_study(db, tmp_path):
     assert plot.stat().st_size > 1000
     stored = db.read("population", report["study"])["linear_model"]
     assert stored.attrs["formula"] == formula
+
+
+def test_analyze_plan__is_a_stored_study(db, tmp_path):
+    plot = tmp_path / "plan.png"
+    formula = "ITA ~ treatment + (1 | subject)"
+    options = ["--effect", "3", "--design", "crossover", "--plot", str(plot)]
+    report = json.loads(analyze(db, "plan", formula, *options, "--json"))
+    rows = [dict(zip(report["header"], row, strict=True)) for row in report["rows"]]
+    assert (rows[0]["quantity"], rows[0]["known_subjects"]) == ("ITA face", 4)
+    assert rows[0]["plan_subjects"] >= 2
+    assert plot.stat().st_size > 1000

@@ -1,0 +1,250 @@
+"""Numbers of subjects that a study needs, from the variances of a database."""
+
+from __future__ import annotations
+
+from dataclasses import MISSING, dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+from xarray import Dataset
+
+from skindb import plots
+from skindb.analysis.formula_models import (
+    INTERCEPT,
+    RESIDUAL,
+    SUBJECT,
+    MixedModel,
+    design_of,
+    information_of,
+    is_constant_within,
+    linear_model,
+    sum_of,
+)
+from skindb.analysis.study import Population, Results, Study, Table, table_of
+from skindb.errors import require
+from skindb.parameters import option
+from skindb.schema import dataset, variables
+from skindb.types import Array, Index
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+SIGNIFICANT = 0.05
+MAX_SUBJECTS = 10_000
+MAX_VISITS = 100
+PEOPLE = 2  # subjects of a design, which stand for all
+PARALLEL = "parallel"
+Design = Literal["parallel", "crossover"]
+COLUMNS = (
+    variables.PLAN_SUBJECTS,
+    variables.PLAN_ERROR,
+    variables.PLAN_BETWEEN,
+    variables.PLAN_WITHIN,
+    variables.PLAN_KNOWN,
+)
+
+
+def sample_sizes(
+    cohort: Dataset,
+    *,
+    formula: str,
+    term: str,
+    effect: float,
+    power: float = 0.8,
+    visits: int = 1,
+    design: Design = "parallel",
+) -> Dataset:
+    """Numbers of subjects with which a model finds an effect.
+
+    Parameters
+    ----------
+    cohort
+        ``db.cohort("tables")`` with several takes of subjects in the condition normal,
+        from which the variances between and within subjects come.
+    formula
+        As in `linear_model`, of `treatment` (0 or 1) and `visit` (1, 2, ...), with ``(1 |
+        subject)``.
+    term
+        Term of the formula, or a sum of multiples of terms.
+    effect
+        Its value, in the unit of the quantity or of its logarithm.
+    power
+        Probability that its p value is below 5 %.
+    visits
+        Visits of each subject.
+    design
+        "parallel": half of the subjects are treated; "crossover": each subject is
+        measured with and without treatment at every visit.
+
+    Returns
+    -------
+    Dataset
+        (quantity,), see the variables of the group "plan": subjects of both arms
+        together, rounded up to pairs in parallel designs, NaN for more than 10,000; and
+        the standard error of the term with as many. Attribute "flags" of the variances.
+
+    Raises
+    ------
+    InputError
+        If the formula has other parts, if the design does not determine it, or if the
+        cohort determines no variances.
+
+    References
+    ----------
+    Noncentral t with the degrees of freedom of `linear_model`; Fitzmaurice, Laird and
+    Ware 2011, chapter 20.
+    """
+    model = MixedModel.of(formula)
+    require(
+        model.is_mixed and not model.slopes,
+        f"formula {formula}",
+        "must have (1 | subject), without slopes",
+        "another random part",
+    )
+    rows = _design(visits, design)
+    x, terms, _ = design_of(model, rows)
+    require(
+        np.linalg.matrix_rank(x) == len(terms),
+        f"formula {formula}",
+        "its terms must be determined by the design",
+        f"{', '.join(terms)}, {visits} visits, {design}",
+        "use fewer terms or more visits",
+    )
+    quantity = formula.partition("~")[0].strip()
+    known = linear_model(cohort, formula=f"{quantity} ~ 1 + (1 | subject)")
+    deviations = known[variables.MODEL_DEVIATION].sel(effect=[INTERCEPT, RESIDUAL])
+    factors = sum_of(term, terms)
+    counts = np.arange(PEOPLE, MAX_SUBJECTS + 1, PEOPLE if design == PARALLEL else 1)
+    free = _degrees_of_freedom(x, rows, factors, counts)
+    needed, errors = [], []
+    for between, within in deviations.values:
+        subjects = rows[SUBJECT].to_numpy()
+        variances = (np.full((1, 1), between**2), within**2)
+        information = information_of(x, np.ones((len(rows), 1)), subjects, *variances)
+        variance = factors @ np.linalg.solve(information, factors)
+        error = np.sqrt(variance * PEOPLE / counts)
+        enough = np.flatnonzero(_power(effect / error, free) >= power)
+        needed.append(counts[enough[0]] if len(enough) else np.nan)
+        errors.append(error[enough[0]] if len(enough) else np.nan)
+    sources = known[variables.MODEL_SUBJECTS].values
+    values = (needed, errors, *deviations.values.T, sources)
+    return dataset(
+        dict(zip(COLUMNS, values, strict=True)),
+        coords={"quantity": known["quantity"].values},
+        attrs={
+            "formula": formula,
+            "term": term,
+            "effect": effect,
+            "power": power,
+            "visits": visits,
+            "design": design,
+            "flags": known.attrs["flags"],
+            "skipped": known.attrs["skipped"],
+        },
+    )
+
+
+def _design(visits: int, design: Design) -> pd.DataFrame:
+    """Subject, treatment and visit of each take of two subjects."""
+    both = [(subject, arm) for subject in (0, 1) for arm in (0, 1)]
+    arms = [pair for pair in both if design != PARALLEL or pair[0] == pair[1]]
+    return pd.DataFrame(
+        [(*pair, float(visit + 1)) for pair in arms for visit in range(visits)],
+        columns=[SUBJECT, "treatment", "visit"],
+    )
+
+
+def _degrees_of_freedom(
+    x: Array, rows: pd.DataFrame, factors: Array, counts: Index
+) -> Array:
+    """Degrees of freedom, as in `linear_model`, with each number of subjects."""
+    is_between = is_constant_within(x, rows[SUBJECT].to_numpy())
+    between = counts - is_between.sum()
+    within = counts * (len(rows) // PEOPLE - 1) - (~is_between).sum()
+    free = np.where(is_between[:, None], between, within)
+    return np.asarray(free[factors != 0].min(axis=0), float)
+
+
+def _power(distance: Array, free: Array) -> Array:
+    """Power of two-sided t tests at 5 % of effects that are `distance` errors from 0."""
+    is_possible = free > 0
+    limit = stats.t.ppf(1 - SIGNIFICANT / 2, np.where(is_possible, free, 1))
+    of_sides = [
+        stats.nct.sf(limit, np.where(is_possible, free, 1), side * distance)
+        for side in (1, -1)
+    ]
+    return np.asarray(np.where(is_possible, np.sum(of_sides, axis=0), 0.0))
+
+
+def tabulate_plan(table: Dataset) -> Table:
+    """Header and one row per quantity."""
+    return table_of(table, COLUMNS, ("quantity",))
+
+
+def describe_plan(table: Dataset) -> list[str]:
+    """The design and notes on the variances, one line each."""
+    about = table.attrs
+    return [
+        f"{about['formula']}: subjects in total that show {about['term']} = "
+        f"{about['effect']:g} at 5 % with a power of {100 * about['power']:g} %, "
+        f"{about['design']}, {about['visits']} visits; empty for more than {MAX_SUBJECTS:,}",
+        "variances come from the repeated takes of the subjects of the database; those who "
+        "leave the study are not counted",
+        *about["flags"],
+    ]
+
+
+def plot_plan(table: Dataset, *, ax: Axes | None = None) -> Axes:
+    """Plot the number of subjects for each quantity."""
+    names = table["quantity"].values.tolist()
+    ax = ax or plots.new_axes(6.5, 1.2 + 0.22 * len(names))
+    places = np.arange(float(len(names)))[::-1]
+    ax.plot(table[variables.PLAN_SUBJECTS], places, "o", color=plots.BLUE)
+    ax.set_yticks(places, names, fontsize=7)
+    ax.set_ylim(-0.6, len(names) - 0.4)
+    ax.set_xlim(left=0)
+    ax.set_xlabel(
+        f"subjects for a power of {100 * table.attrs['power']:g} %\n"
+        f"{table.attrs['term']} = {table.attrs['effect']:g}"
+    )
+    return ax
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the study that plans another one."""
+
+    formula: str = option(
+        MISSING, "Formula, such as: ITA ~ treatment * visit + (1 | subject)."
+    )
+    term: str = option("treatment", "Term to find, or a sum of multiples of terms.")
+    effect: float = option(
+        1.0, "Its value, in the unit of the quantity.", minimum=-1e9, maximum=1e9
+    )
+    power: float = option(0.8, "Probability to find it.", minimum=0.1, maximum=0.99)
+    visits: int = option(1, "Visits of each subject.", minimum=1, maximum=MAX_VISITS)
+    design: Literal["parallel", "crossover"] = option(
+        "parallel",
+        "Half of the subjects are treated, or all are measured with and without.",
+    )
+
+
+def compute(population: Population, parameters: Parameters) -> Results:
+    """The results of the study."""
+    return {"plan": sample_sizes(population.cohort, **vars(parameters))}
+
+
+STUDY = Study(
+    name="plan",
+    description="numbers of subjects that a study needs, from the variances of repeats",
+    layout="tables",
+    parameters=Parameters,
+    compute=compute,
+    shown=("plan",),
+    tabulate=tabulate_plan,
+    plot=plot_plan,
+    describe=describe_plan,
+    counts_takes=True,
+)
