@@ -27,17 +27,19 @@ from benchmarks.truth import read_truth
 from benchmarks.truth import regions as true_regions
 from skindb.analysis import register
 from skindb.analysis.regions import own_masks, region_masks
-from skindb.analysis.registration import corresponding_points, interpolate, surface_of
+from skindb.analysis.registration import interpolate, surface_of
 from skindb.format.folder import read_capture
 from skindb.geometry.atlas import disc_atlas
 from skindb.geometry.clean import clean_mesh
 from skindb.geometry.mesh import closest_on_mesh
+from skindb.geometry.rays import RayScene
 from skindb.ingest.groups import mesh_group, surfel_group
 from skindb.ingest.surfels import build_surfels
 from skindb.schema import dataset, variables
 
 Array = NDArray[np.floating[Any]]
 Models = dict[str, xr.DataTree]
+HEIGHT = 1e-2  # of the plane from which rays start, in units of uv
 COUNTS = (20, 16, 12, 8, 5, 3, 2)
 SMOOTHINGS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
 CLICKS = (0.5, 1.0, 2.0, 3.0)  # mm rms, each axis
@@ -46,6 +48,28 @@ BACK = 25.0  # mm that are cut off at the back of the head
 PRESENT = 3.0  # mm from the scan; farther points are not on it
 # region from landmarks -> names of the same region in other data
 BESIDE = {"neck": ("neck", "neck_beard")}
+
+
+def corresponding_points(
+    model: xr.DataTree, registered: xr.Dataset, common: Array
+) -> Array:
+    """Surface points (n, 3) [mm] of a take at common texture coordinates (n, 2); NaN
+    outside its surface.
+    """
+    position, _, faces = surface_of(model)
+    # the map has no folds: a ray perpendicular to the plane meets the only triangle
+    # that contains the point
+    flat = RayScene(
+        np.pad(registered[variables.COMMON_UV].values.astype(float), ((0, 0), (0, 1))),
+        faces,
+    )
+    start = np.pad(np.asarray(common, float), ((0, 0), (0, 1)), constant_values=HEIGHT)
+    face, corner, _ = flat.first_hit(start, np.array([[0.0, 0.0, -1.0]]))
+    return np.where(
+        (face >= 0)[:, None],
+        interpolate(position, faces[np.maximum(face, 0)], corner),
+        np.nan,
+    )
 
 
 def correspondence_error(

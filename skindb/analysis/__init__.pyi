@@ -48,7 +48,6 @@ from .maps import (
 from .planning import describe_plan, plot_plan, sample_sizes
 from .regions import region_masks, take_masks
 from .registration import (
-    corresponding_points,
     doubtful_landmarks,
     register,
     tabulate_registration,
@@ -90,7 +89,6 @@ __all__ = [
     "cohort_of",
     "common_maps",
     "component_correlations",
-    "corresponding_points",
     "coverage_report",
     "describe_basis_size",
     "describe_brdf_space",

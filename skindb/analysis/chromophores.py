@@ -232,21 +232,18 @@ def chromophore_maps(maps: Dataset, axes: Dataset) -> Dataset:
     -------
     Dataset
         `texel_chromophore` (v, u, chromophore): optical density (-ln R_d) at green due
-        to the pigment, relative to the mean of the cohort (amounts may be negative);
-        `texel_chromophore_residual` (v, u): the part of -ln R_d along the third
-        direction, which neither pigment explains. NaN where nothing was measured.
+        to the pigment, relative to the mean of the cohort (amounts may be negative). NaN
+        where nothing was measured.
     """
     density, measured = _density(maps)
-    amounts, residual = _unmixed(
+    amounts = _unmixed(
         density,
         axes[variables.CHROMOPHORE_AXIS].values,
         axes[variables.CHROMOPHORE_OFFSET].values,
     )
+    measured_amounts = np.where(measured[..., None], amounts, np.nan)
     return dataset(
-        {
-            variables.TEXEL_CHROMOPHORE: np.where(measured[..., None], amounts, np.nan),
-            variables.TEXEL_CHROMOPHORE_RESIDUAL: np.where(measured, residual, np.nan),
-        },
+        {variables.TEXEL_CHROMOPHORE: measured_amounts},
         coords={"chromophore": CHROMOPHORES},
     )
 
@@ -270,21 +267,19 @@ def chromophore_statistics(
     Returns
     -------
     Dataset
-        `take_chromophore`, `take_chromophore_deviation` (take, region, chromophore) and
-        `take_chromophore_residual` (take, region). NaN for regions of which less than
-        half was measured.
+        `take_chromophore` and `take_chromophore_deviation` (take, region, chromophore).
+        NaN for regions of which less than half was measured.
     """
     drawn = map_regions(landmarks or {}, cohort.sizes["v"])
     masks = np.stack(list(drawn.values()))
     vectors = axes[variables.CHROMOPHORE_AXIS].values
     offset = axes[variables.CHROMOPHORE_OFFSET].values
     rows = each_take(_statistics, cohort, MAPPED, masks, vectors, offset)
-    mean, deviation, residual = (np.stack(column) for column in zip(*rows, strict=True))
+    mean, deviation = (np.stack(column) for column in zip(*rows, strict=True))
     return dataset(
         {
             variables.TAKE_CHROMOPHORE: mean,
             variables.TAKE_CHROMOPHORE_DEVIATION: deviation,
-            variables.TAKE_CHROMOPHORE_RESIDUAL: residual,
         },
         coords={
             "take": cohort["take"].values.tolist(),
@@ -460,30 +455,25 @@ def _published_axes(plane: _Plane) -> tuple[Array, str]:
     return TABLE_AXES.copy(), PUBLISHED
 
 
-def _unmixed(density: Array, axes: Array, offset: Array) -> tuple[Array, Array]:
-    """Amounts (..., 2) by least squares, and the residual (...) along the normal of both axes."""
-    inner = density - offset
-    normal = np.cross(axes[0], axes[1])
-    return inner @ np.linalg.pinv(axes), inner @ (normal / np.linalg.norm(normal))
+def _unmixed(density: Array, axes: Array, offset: Array) -> Array:
+    """Amounts (..., 2) by least squares."""
+    return np.asarray((density - offset) @ np.linalg.pinv(axes))
 
 
 def _statistics(
     maps: Dataset, masks: Mask, axes: Array, offset: Array
-) -> tuple[Array, Array, Array]:
-    """Mean and standard deviation (region, chromophore), and RMS residual (region,)."""
+) -> tuple[Array, Array]:
+    """Mean and standard deviation (region, chromophore)."""
     density, measured = _density(maps)
     covered = covered_fractions(measured, masks)
     mean, deviation = np.full((2, len(masks), len(CHROMOPHORES)), np.nan)
-    residuals = np.full(len(masks), np.nan)
     for r, mask in enumerate(masks):
         # the first region is the face, which needs no minimum coverage
-        if not (covered[r] >= LEAST_COVERED if r else measured.any()):
-            continue
-        amounts, residual = _unmixed(density[measured & mask], axes, offset)
-        mean[r] = amounts.mean(axis=0)
-        deviation[r] = amounts.std(axis=0)
-        residuals[r] = np.sqrt(np.mean(residual**2))
-    return mean, deviation, residuals
+        if covered[r] >= LEAST_COVERED or (r == 0 and measured.any()):
+            amounts = _unmixed(density[measured & mask], axes, offset)
+            mean[r] = amounts.mean(axis=0)
+            deviation[r] = amounts.std(axis=0)
+    return mean, deviation
 
 
 def _angle(a: Array, b: Array) -> Array:

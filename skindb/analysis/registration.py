@@ -16,7 +16,6 @@ from skindb.errors import require
 from skindb.geometry.atlas import signed_areas
 from skindb.geometry.landmarks import mean_shape
 from skindb.geometry.mesh import closest_on_mesh
-from skindb.geometry.rays import RayScene
 from skindb.geometry.warp import (
     ALIGNED,
     Sheet,
@@ -44,7 +43,6 @@ IMPOSSIBLE_ERROR = 20.0  # mm, more than faces can differ
 # minimum number of landmarks of the template, as a fraction of the largest number in a
 # take
 TEMPLATE_FRACTION = 0.75
-HEIGHT = 1e-2  # of the plane from which rays start, in units of uv
 
 
 def register(
@@ -293,28 +291,6 @@ def _registration_dataset(sheet: Sheet, take: str, frame: Frame, warp: Warp) -> 
             "warp_anchors": anchors,
             "warp_flips": int(turned.sum()),
         },
-    )
-
-
-def corresponding_points(
-    model: DataTree, registered: Dataset, common: Array
-) -> Float64:
-    """Surface points (n, 3) [mm] of a take at common texture coordinates (n, 2); NaN
-    outside its surface.
-    """
-    position, _, faces = surface_of(model)
-    # the map has no folds: a ray perpendicular to the plane meets the only triangle
-    # that contains the point
-    flat = RayScene(
-        np.pad(registered[variables.COMMON_UV].values.astype(float), ((0, 0), (0, 1))),
-        faces,
-    )
-    start = np.pad(float64(common), ((0, 0), (0, 1)), constant_values=HEIGHT)
-    face, corner, _ = flat.first_hit(start, np.array([[0.0, 0.0, -1.0]]))
-    return np.where(
-        (face >= 0)[:, None],
-        interpolate(position, faces[np.maximum(face, 0)], corner),
-        np.nan,
     )
 
 

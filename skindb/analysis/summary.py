@@ -25,6 +25,8 @@ from skindb.types import AnyArray, Array, Index, Mask, finite_rows
 # of one subject
 SAMPLED = 5000
 STREAM = 7  # random stream of the sample
+# constants and means of the group "basis" that studies of the dictionary need
+IN_TABLES = (variables.MEAN_DICTIONARY_WEIGHT, variables.DISC_ANGULAR_RADIUS)
 SIZE = 512  # texels along each side of the stored maps of a registration
 
 
@@ -76,7 +78,7 @@ def sample_surfels(
 
 
 def summary_tables(model: DataTree) -> Dataset:
-    """Tables of one model for population studies: regions, basis and probe sites.
+    """Tables of one model for population studies: regions, dictionary and probe sites.
 
     Returns
     -------
@@ -84,14 +86,14 @@ def summary_tables(model: DataTree) -> Dataset:
         For every region (those of the capture, and "face" for all surfels): number and
         area of the trusted surfels, area-weighted means of diffuse and surface
         reflectance with their errors. For every site: sigma_tr with its errors and
-        status. Mixtures of the reduced basis, mean weights of the dictionary, and the
-        refractive index.
+        status. Mean weights of the dictionary, and the radius of the lights' discs.
     """
     fitted = model["fitted"].to_dataset().load()
+    basis = model["basis"].to_dataset()
     masks = {FACE: np.ones(fitted.sizes["surfel"], bool)} | own_masks(fitted)
     parts = [
         region_tables(fitted, masks),
-        _basis_tables(model, fitted),
+        basis[[name for name in IN_TABLES if name in basis]].load(),
     ]
     if "translucency" in model.children:
         sites = model["translucency"].to_dataset()
@@ -183,19 +185,6 @@ def no_surfels_error(model: DataTree) -> InputError:
         "none",
         "skip the take or fit it again",
     )
-
-
-def _basis_tables(model: DataTree, fitted: Dataset) -> Dataset:
-    """Mixtures of the reduced basis, mean weights of the dictionary, and constants."""
-    basis = model["basis"].to_dataset()
-    names = (
-        variables.BASIS_MIXTURE,
-        variables.MEAN_DICTIONARY_WEIGHT,
-        variables.DISC_ANGULAR_RADIUS,
-    )
-    tables = basis[[name for name in names if name in basis]].load()
-    index = [name for name in (variables.REFRACTIVE_INDEX,) if name in fitted]
-    return xr.merge([tables, fitted[index].reset_coords(drop=True)])
 
 
 def _weighted_mean(values: Array, errors: Array, weight: Array) -> tuple[Array, Array]:

@@ -555,19 +555,11 @@ TAKE_CHROMOPHORE_DEVIATION = declare(
     "float64 chromophores/take_chromophore_deviation(take, region, chromophore) [1]",
     "standard deviation over texels",
 )
-TAKE_CHROMOPHORE_RESIDUAL = declare(
-    "float64 chromophores/take_chromophore_residual(take, region) [1]",
-    "RMS of ln R_d that no pigment explains",
-)
 
 # chromophore_maps
 TEXEL_CHROMOPHORE = declare(
     "float32 chromophore_maps/texel_chromophore(v, u, chromophore) [1]",
     "what the pigment takes from ln R_d at green, less the mean of the takes",
-)
-TEXEL_CHROMOPHORE_RESIDUAL = declare(
-    "float32 chromophore_maps/texel_chromophore_residual(v, u) [1]",
-    "what no pigment explains of -ln R_d",
 )
 
 # chromophore_table

@@ -23,7 +23,12 @@ from planted_sheet import (
     sheet_take,
 )
 
-from benchmarks.registration import correspondence_error, mask_agreement, unregistered
+from benchmarks.registration import (
+    correspondence_error,
+    corresponding_points,
+    mask_agreement,
+    unregistered,
+)
 from skindb.analysis.albedo import albedo_histograms
 from skindb.analysis.regions import (
     FINE,
@@ -31,7 +36,6 @@ from skindb.analysis.regions import (
     take_masks,
 )
 from skindb.analysis.registration import (
-    corresponding_points,
     describe_registration,
     doubtful_landmarks,
     register,
