@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from skindb.geometry.camera import project
 from skindb.geometry.rays import RayScene
 from skindb.render.monte_carlo import Lighting
 from skindb.render.scene import Camera, Lights, Surface
@@ -68,10 +67,9 @@ def plan_scene(
 
     Notes
     -----
-    Measured by benchmarks/omissions.py on a face that covers 45 % of the picture:
-    without the other pixels a picture takes 46 % less CPU time under one light, 26 %
-    less under the 32 lights of a dome, and 15 % less in an environment. Planning takes
-    0.1 s. `KEPT` lists what would not pay.
+    Measured once, no script kept: on a face that covers 44 % of the picture, and the box
+    around it 54 %, a picture without the other pixels takes 14 % less CPU time under one
+    light, and 4 % less under the 32 lights of a dome. `KEPT` lists what would not pay.
     """
     pixels, skipped = covered_pixels(surface, camera)
     view = trace_view(surface, camera, scene=scene, pixels=pixels)
@@ -106,33 +104,20 @@ def plan_octree(error: float | None) -> Omission:
 
 
 def covered_pixels(surface: Surface, camera: Camera) -> tuple[Mask, Omissions]:
-    """Pixels (h, w) that triangles may cover: those that the box around a projected
-    triangle meets.
-    """
-    faces = np.asarray(surface.faces)
-    view = (camera.K, camera.R, camera.t, camera.distortion)
-    corner = project(surface.vertices, *view)[0][faces]
-    middle = project(surface.vertices[faces].mean(axis=1), *view)[0]
-    if not (np.isfinite(corner).all() and np.isfinite(middle).all()):
-        # triangles behind the camera
-        return np.ones((camera.height, camera.width), bool), ()
+    """Pixels (h, w) that triangles may cover: those of the box around the projected surface."""
+    corner = camera.project(surface.vertices)[surface.faces]
+    middle = camera.project(surface.vertices[surface.faces].mean(axis=1))
     # distortion curves edges by about as much as it moves the middle of a triangle
     margin = 1 + 4 * np.abs(middle - corner.mean(axis=1)).max()
-    size = (camera.width, camera.height)
-    low = np.clip(np.floor(corner.min(axis=1) - margin), 0, size).astype(np.int64)
-    high = np.clip(np.ceil(corner.max(axis=1) + margin), 0, size).astype(np.int64)
-    edges = np.zeros((camera.height + 1, camera.width + 1), np.int64)
-    for x, y, sign in (
-        (low, low, 1),
-        (high, high, 1),
-        (low, high, -1),
-        (high, low, -1),
-    ):
-        np.add.at(edges, (y[:, 1], x[:, 0]), sign)
-    mask = edges.cumsum(axis=0).cumsum(axis=1)[:-1, :-1] > 0
+    mask = np.ones((camera.height, camera.width), bool)
+    if np.isfinite(margin):  # otherwise triangles are behind the camera
+        low = np.maximum(corner.min(axis=(0, 1)) - margin, 0).astype(int)
+        high = np.maximum(corner.max(axis=(0, 1)) + margin + 1, 0).astype(int)
+        mask[:] = False
+        mask[low[1] : high[1], low[0] : high[0]] = True
     empty = int((~mask).sum())
     return mask, (
-        Omission("pixels", empty, mask.size, "no triangle covers them"),
+        Omission("pixels", empty, mask.size, "they are beside the surface"),
     ) if empty else ()
 
 
