@@ -86,10 +86,8 @@ def chart_reference() -> Float64:
 
     chart = colour.CCS_COLOURCHECKERS[CHART]
     tristimulus = colour.xyY_to_XYZ(np.array(list(chart.data.values())))
-    return np.asarray(
-        colour.XYZ_to_sRGB(
-            tristimulus, illuminant=chart.illuminant, apply_cctf_encoding=False
-        )
+    return colour.XYZ_to_sRGB(
+        tristimulus, illuminant=chart.illuminant, apply_cctf_encoding=False
     )
 
 
@@ -153,7 +151,7 @@ def _difference(measured: Float64, expected: Float64) -> Float64:
         colour.XYZ_to_Lab(colour.sRGB_to_XYZ(c, apply_cctf_decoding=False))
         for c in (measured, expected)
     ]
-    return np.asarray(colour.delta_E(*lab, method="CIE 2000"))
+    return colour.delta_E(*lab, method="CIE 2000")
 
 
 def calibrate_cameras(dome: DomeRecord, frames: CalibrationFrames) -> xr.Dataset:

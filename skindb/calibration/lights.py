@@ -170,7 +170,7 @@ def distant_light(outline: Outline, highlight: ArrayLike) -> Float64:
         "check the centre and radius of the ball",
     )
     normal = np.array([*offset, np.sqrt(1 - square)])
-    return np.asarray(2 * normal[2] * normal - [0, 0, 1])
+    return 2 * normal[2] * normal - [0, 0, 1]
 
 
 def reflected_ray(
@@ -248,7 +248,7 @@ def ball_centre(
         distances.append(radius / np.sqrt(1 - min(1 / length**2, 1 - 1e-12)))
     start = np.array([camera.centre for camera in cameras])
     if len(cameras) == 1:
-        return np.asarray(start[0] + distances[0] * directions[0])
+        return start[0] + distances[0] * directions[0]
     centre = light_position(start, directions).position
     ratio = lengths(centre - start) / np.array(distances)
     mismatch = float(np.abs(ratio - 1).max())

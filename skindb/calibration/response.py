@@ -135,7 +135,7 @@ def recover_response(
 
 def _place(value: Float64) -> Float64:
     """Coordinate in which the knots are evenly spaced, 0 at black and 1 at white."""
-    return np.asarray(np.arcsinh(value / TOE) / np.arcsinh(1 / TOE))
+    return np.arcsinh(value / TOE) / np.arcsinh(1 / TOE)
 
 
 def _curve(value: Float64, log_ratio: Float64) -> Float64:
@@ -146,7 +146,7 @@ def _curve(value: Float64, log_ratio: Float64) -> Float64:
 
 def _rising(curve: Float64) -> Float64:
     """The running maximum of a curve, which rises slightly where the curve falls."""
-    return np.asarray(np.maximum.accumulate(curve) + MIN_RISE * np.arange(len(curve)))
+    return np.maximum.accumulate(curve) + MIN_RISE * np.arange(len(curve))
 
 
 def _fit_channel(samples: ResponseSamples) -> Float64:
@@ -172,7 +172,7 @@ def _mean_exposure_value(pixels: Float64, log_ratio: Float64) -> Float64:
     mean = exposure.mean(axis=-1)
     usable = mean > MIN_SIGNAL_TO_NOISE * exposure.std(axis=-1)
     value = np.interp(mean, curve, grid)
-    return np.asarray(np.where(usable, value, pixels.mean(axis=-1)))
+    return np.where(usable, value, pixels.mean(axis=-1))
 
 
 def _fit_values(
@@ -451,4 +451,4 @@ def _outliers(picture: Float64) -> Mask:
     )
     spread = robust_deviation(apart, axis=(0, 1))
     # in a perfectly even picture every difference is an outlier
-    return np.asarray((np.abs(apart) > MAX_DEVIATIONS * spread) & (apart != 0))
+    return (np.abs(apart) > MAX_DEVIATIONS * spread) & (apart != 0)

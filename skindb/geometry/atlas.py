@@ -265,7 +265,7 @@ def _upright(uv: Array, points: Array, faces: Index) -> Float64:
     cosine = np.cos(angle)
     sine = np.sin(angle)
     turned = uv @ np.array([[cosine, -sine], [sine, cosine]])
-    return np.asarray(turned + 0.5)
+    return turned + 0.5
 
 
 def flipped(uv: Array, faces: Faces) -> Mask:
@@ -273,7 +273,7 @@ def flipped(uv: Array, faces: Faces) -> Mask:
     rounding hides it.
     """
     plus, minus = _area_products(uv[faces])
-    return np.asarray(plus - minus <= CERTAIN * (np.abs(plus) + np.abs(minus)))
+    return plus - minus <= CERTAIN * (np.abs(plus) + np.abs(minus))
 
 
 def stretches(

@@ -177,7 +177,7 @@ def _drop_repeated(points: Float64, faces: Index, report: _Report) -> Index:
     flipped = repeated & (odd != odd[original])
     report.add("duplicate_faces", points, faces[repeated & ~flipped])
     report.add("flipped_duplicates", points, faces[flipped])
-    return np.asarray(faces[~repeated])
+    return faces[~repeated]
 
 
 def _weld(points: Float64, faces: Index, report: _Report) -> tuple[Index, Index]:
@@ -249,7 +249,7 @@ def _largest_component(points: Float64, faces: Index, report: _Report) -> Index:
     _, start = np.unique(label[island][order], return_index=True)
     islands = [part.ravel() for part in np.split(faces[island][order], start)[1:]]
     report.add("islands", points, islands)
-    return np.asarray(faces[keep])
+    return faces[keep]
 
 
 def _split_bow_ties(faces: Index, n: int) -> tuple[Index, Index]:
@@ -337,7 +337,7 @@ def sliver_mask(
     sides = p - np.roll(p, -1, axis=1)
     longest = np.einsum("fki,fki->fk", sides, sides).max(axis=1, initial=0.0)
     double_area = lengths(np.cross(sides[:, 0], sides[:, 1]))
-    return np.asarray(double_area <= min_ratio * longest)
+    return double_area <= min_ratio * longest
 
 
 def fill_hole(

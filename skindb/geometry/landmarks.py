@@ -128,7 +128,7 @@ def _mean_of_complete(shapes: Array) -> Float64:
     complete = np.isfinite(shapes).all(axis=2, keepdims=True)
     total = shapes.sum(axis=0, where=complete)
     with np.errstate(invalid="ignore"):
-        return np.asarray(total / complete.sum(axis=0))
+        return total / complete.sum(axis=0)
 
 
 def mate(name: str) -> str:
@@ -149,7 +149,7 @@ def nose_tip(vertices: Array) -> Float64:
     points = float64(vertices)
     across = points[:, 0] - np.median(points[:, 0])
     strip = points[np.abs(across) <= MIDDLE_FRACTION * np.ptp(points[:, 0])]
-    return np.asarray(strip[np.argmax(strip[:, 2])])
+    return strip[np.argmax(strip[:, 2])]
 
 
 def suggest_landmarks(

@@ -123,7 +123,7 @@ def winding_flips(faces: Faces) -> Mask:
     flip = sides[:n] != component
     total = np.bincount(component)
     fewer = 2 * np.bincount(component, flip) <= total
-    return np.asarray(flip == fewer[component])
+    return flip == fewer[component]
 
 
 def fans(faces: Faces) -> Index:
@@ -340,7 +340,7 @@ def _closest(point: Array, triangles: Array) -> Float64:
         off = start + t[:, None] * edge - point
         squared.append(dots(off, off))
     best = np.argmin(squared, axis=0)
-    return np.asarray(np.stack(weights)[best, np.arange(len(best))])
+    return np.stack(weights)[best, np.arange(len(best))]
 
 
 def _square(a: Array) -> Float64:

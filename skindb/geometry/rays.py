@@ -176,7 +176,7 @@ class RayScene:
             return np.zeros(0, np.int32)
         length = np.full(len(start), 1e37, np.float32) if reach is None else reach
         single = (rays.astype(np.float32, copy=False) for rays in (start, way))
-        return np.asarray(self._scene.run(*single, length, query=query))
+        return self._scene.run(*single, length, query=query)
 
 
 def _refine(

@@ -396,7 +396,7 @@ class Environment:
             np.arctan2(direction[:, 0], direction[:, 2]) / (2 * np.pi) + 0.5
         ) * width
         row_start = np.minimum(row.astype(np.int64), height - 1) * width
-        return np.asarray(row_start + np.minimum(column.astype(np.int64), width - 1))
+        return row_start + np.minimum(column.astype(np.int64), width - 1)
 
     @cached_property
     def _solid_angle(self) -> Array:
@@ -407,7 +407,7 @@ class Environment:
     @cached_property
     def _probability(self) -> Array:
         power = self.radiance.reshape(-1, 3) @ LUMINANCE * self._solid_angle
-        return np.asarray(power / power.sum())
+        return power / power.sum()
 
     @cached_property
     def _rising(self) -> tuple[Index, Array]:

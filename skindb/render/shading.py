@@ -132,7 +132,7 @@ def bounced_exitance(surface: Surface, received: Array) -> Array:
     `received` (v, 3) or (v, 1) is the irradiance under the boundary by the lights.
     """
     diffuse = np.nan_to_num(surface.diffuse)
-    return np.asarray(diffuse * (surface.transfer @ (diffuse * received)))
+    return diffuse * (surface.transfer @ (diffuse * received))
 
 
 def tree_opening(error: float | None) -> tuple[float, float]:
@@ -232,9 +232,7 @@ class View:
 
     def interpolate(self, values: Array) -> Array:
         """Values (v, c) of the vertices at the hits, (n, c)."""
-        return np.asarray(
-            np.einsum("nk,nkc->nc", self.barycentric, values[self.corners])
-        )
+        return np.einsum("nk,nkc->nc", self.barycentric, values[self.corners])
 
     def image(self, values: Array) -> Image:
         """(h, w, c) means over each pixel's rays of values (n, c) at the hits; rays
@@ -433,7 +431,7 @@ def _lamp_points(lights: Lights, i: int, total: int) -> Array:
         np.cos(q * GOLDEN_ANGLE)[:, None] * tangent
         + np.sin(q * GOLDEN_ANGLE)[:, None] * second
     )
-    return np.asarray(lights.position[i] + radius[:, None] * across)
+    return lights.position[i] + radius[:, None] * across
 
 
 def _lit(scene: RayScene, view: View, lamp: Array) -> Float32:

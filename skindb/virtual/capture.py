@@ -536,7 +536,7 @@ def foot_points(
 
 def at_foot_points(values: Array, corner: Array) -> Array:
     """Values (n, 3, c) of the corners, interpolated (n, c)."""
-    return np.asarray(np.einsum("nkc,nk->nc", values.astype(float), corner))
+    return np.einsum("nkc,nk->nc", values.astype(float), corner)
 
 
 def _sites(model: xr.DataTree, truth: Mapping[str, Array]) -> dict[str, Array]:

@@ -263,9 +263,7 @@ class Sensor:
             )
         step = self.step if averaged == 1 else 1
         value = np.float32(self.black) + electrons / np.float32(self.electrons_per_dn)
-        return np.asarray(
-            np.clip(np.rint(value / step) * step, 0, self.white).astype(np.uint16)
-        )
+        return np.clip(np.rint(value / step) * step, 0, self.white).astype(np.uint16)
 
 
 def write_png(path: Path, frame: Values16) -> None:

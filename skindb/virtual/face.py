@@ -92,7 +92,7 @@ def _ellipsoid(
     x = x / radii[0]
     y = y / radii[1]
     z = z / radii[2]
-    return np.asarray(length * (length - 1) / np.sqrt(x * x + y * y + z * z + 1e-12))
+    return length * (length - 1) / np.sqrt(x * x + y * y + z * z + 1e-12)
 
 
 def _cone(
@@ -110,7 +110,7 @@ def _cone(
     x = x - along * axis[0]
     y = y - along * axis[1]
     z = z - along * axis[2]
-    return np.asarray(np.sqrt(x * x + y * y + z * z) - ra - along * (rb - ra))
+    return np.sqrt(x * x + y * y + z * z) - ra - along * (rb - ra)
 
 
 def _join(a: Float64, b: Float64, blend: float) -> Float64:
@@ -133,7 +133,7 @@ def _press(
 ) -> Float64:
     """Push the skin in by `depth` under a Gaussian (a negative depth lifts it)."""
     x, y, z = ((p[i] - centre[i]) / width[i] for i in range(3))
-    return np.asarray(distance + depth * np.exp(-0.5 * (x * x + y * y + z * z)))
+    return distance + depth * np.exp(-0.5 * (x * x + y * y + z * z))
 
 
 def _skull(p: Float64, s: FaceShape) -> Float64:
@@ -220,9 +220,8 @@ def _nose(p: Float64, d: Float64, s: FaceShape) -> Float64:
     nostril = np.hypot(groove, (p[2] - tip[2] + 6) / 6)
     d = d + 2.4 * np.exp(-0.5 * nostril**2)
     alar = np.hypot(p[0] - w, (p[1] - tip[1] + 9) * 0.9) - 10.5
-    return np.asarray(
-        d
-        + 0.9 * np.exp(-0.5 * (alar / 2.0) ** 2 - 0.5 * ((p[2] - tip[2] + 14) / 7) ** 2)
+    return d + 0.9 * np.exp(
+        -0.5 * (alar / 2.0) ** 2 - 0.5 * ((p[2] - tip[2] + 14) / 7) ** 2
     )
 
 

@@ -108,7 +108,7 @@ def _disc_shares(middle: Float64, distance: Float64) -> Float64:
         * r
         * np.arccos(np.clip((r * r + d * d - FIBRE_RADIUS**2) / (2 * r * d), -1, 1))
     )
-    return np.asarray(arc / arc.sum(axis=1, keepdims=True))
+    return arc / arc.sum(axis=1, keepdims=True)
 
 
 def _smooth(distance: Float64, value: Float64, error: Float64) -> Float64:

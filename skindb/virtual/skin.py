@@ -42,7 +42,7 @@ def smooth_noise(
         points.astype(np.float32) @ vector.T.astype(np.float32)
         + phase.astype(np.float32)
     )
-    return np.asarray(wave.sum(axis=1, dtype=float) * np.sqrt(2 / WAVES))
+    return wave.sum(axis=1, dtype=float) * np.sqrt(2 / WAVES)
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class SkinTables:
 def _axis(light: Float64, dark: Float64) -> Float64:
     """Direction from a lighter to a darker colour in log reflectance, 1 in green."""
     step = np.log(light) - np.log(dark)
-    return np.asarray(step / step[1])
+    return step / step[1]
 
 
 @cache
@@ -189,7 +189,7 @@ def _diffuse_reflectance(
     colour = np.exp(
         log - np.outer(melanin, tables.melanin) - np.outer(blood, tables.haemoglobin)
     )
-    return np.asarray(np.clip(colour * (1 - _hair(head, person)), 0.008, 0.95))
+    return np.clip(colour * (1 - _hair(head, person)), 0.008, 0.95)
 
 
 def _pigment(head: Head, person: Person) -> tuple[Float64, Float64]:
@@ -242,7 +242,7 @@ def _hair(head: Head, person: Person) -> Float64:
     lash = 0.6 * m.get("lash", 0 * brow)
     stubble = np.clip(0.45 * person.beard_density * m["beard"] * strands, 0, 0.75)
     keep = (1 - brow) * (1 - lash)
-    return np.asarray(1 - keep[:, None] * (1 - np.outer(stubble, [1.0, 0.95, 0.86])))
+    return 1 - keep[:, None] * (1 - np.outer(stubble, [1.0, 0.95, 0.86]))
 
 
 def _weights(
@@ -271,9 +271,7 @@ def _weights(
     albedo = (
         field[:, 0] * (1 + 0.05 * smooth_noise(p, 25, rng=rng)) * rng.lognormal(0, 0.06)
     )
-    return np.asarray(
-        np.clip(albedo, 0.03, 0.06)[:, None] * effect.gloss * share / material_albedo
-    )
+    return np.clip(albedo, 0.03, 0.06)[:, None] * effect.gloss * share / material_albedo
 
 
 def _sites(
