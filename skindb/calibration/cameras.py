@@ -244,23 +244,28 @@ def calibrated_cameras(
 
 
 def _calibrated(camera: CameraRecord, calibration: xr.Dataset) -> CameraRecord:
+    known = {
+        str(name): values.values
+        for name, values in calibration.items()
+        if np.isfinite(values).all()
+    }
     sensor = camera.sensor
-    response = calibration["calibrated_response"].values
-    if np.isfinite(response).all():
+    if "calibrated_response" in known:
         levels = calibration["response_level"].values
         values = sensor.black + levels * (sensor.white - sensor.black)
-        table = np.column_stack([values, response])
+        table = np.column_stack([values, known["calibrated_response"]])
         sensor = replace(sensor, response=table, response_file=None)
-    if np.isfinite(gain := float(calibration["calibrated_electrons_per_value"])):
-        noise = float(calibration["calibrated_read_noise"])
-        sensor = replace(sensor, electrons_per_dn=gain, read_noise=noise)
-    vignette = calibration["calibrated_vignette"].values
-    colours = calibration["calibrated_colour_matrix"].values
+    if "calibrated_electrons_per_value" in known:
+        sensor = replace(
+            sensor,
+            electrons_per_dn=float(known["calibrated_electrons_per_value"]),
+            read_noise=float(known["calibrated_read_noise"]),
+        )
     return replace(
         camera,
         sensor=sensor,
-        vignette=vignette if np.isfinite(vignette).all() else camera.vignette,
-        colour_matrix=colours if np.isfinite(colours).all() else camera.colour_matrix,
+        vignette=known.get("calibrated_vignette", camera.vignette),
+        colour_matrix=known.get("calibrated_colour_matrix", camera.colour_matrix),
     )
 
 

@@ -71,16 +71,13 @@ def _fibre_means(radiance: Image, error: Image) -> tuple[Float64, Float64]:
     """Mean (3,) over the pixels (n, 3) of a fibre, and its standard error; NaN of a
     channel with too many saturated pixels.
     """
-    value = np.full(3, np.nan)
-    spread = np.full(3, np.nan)
-    signal = radiance.astype(float)
-    noise = error.astype(float)
-    for c in range(3):
-        usable = np.isfinite(signal[:, c])
-        if 1 - usable.mean() <= MAX_LOST_FRACTION:
-            value[c] = signal[usable, c].mean()
-            spread[c] = np.sqrt((noise[usable, c] ** 2).sum()) / usable.sum()
-    return value, spread
+    usable = np.isfinite(radiance)
+    count = np.maximum(usable.sum(axis=0), 1)
+    value = radiance.sum(axis=0, dtype=float, where=usable) / count
+    variance = np.square(error, dtype=float).sum(axis=0, where=usable)
+    lost = 1 - usable.mean(axis=0) > MAX_LOST_FRACTION
+    value[lost] = np.nan
+    return value, np.where(lost, np.nan, np.sqrt(variance) / count)
 
 
 def place_text(site: str, placement: str) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
@@ -310,10 +311,8 @@ def _flattest_first(rough: Float64, bright: Float64) -> Index:
     low, high = (bright.min(), bright.max()) if len(bright) else (0.0, 1.0)
     relative = (bright - low) / max(high - low, 1e-12)
     stratum = np.minimum((relative * STRATA).astype(int), STRATA - 1)
-    order = np.lexsort((rough, stratum))
-    start = np.searchsorted(stratum[order], np.arange(STRATA))
-    rank = np.arange(len(order)) - start[stratum[order]]
-    return order[np.argsort(rank, kind="stable")]
+    rank = pd.Series(rough).groupby(stratum).rank("first")
+    return np.lexsort((stratum, rank))
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,9 @@ import numpy as np
 import OpenEXR
 from numpy.typing import ArrayLike
 
-from skindb.errors import Fault, InputError, input_error
-from skindb.files import private_file
+from skindb.errors import input_error
+from skindb.files import open_regular, private_file
+from skindb.limits import MAX_FRAME_BYTES
 from skindb.types import AnyArray, Bytes, Float32, Float64, Mask, float64
 
 Image = Float32
@@ -110,8 +111,9 @@ def read_exr(path: str | Path) -> tuple[Image, tuple[str, ...]]:
     """Read the channels of an OpenEXR file (h, w, c) as float32, and their names; R, G,
     B, A come first.
     """
-    # raises an error for a missing file, for which the library only prints a line
-    _bytes(path, count=4)
+    # of a missing file, the library only prints a line
+    with open_regular(Path(path), MAX_FRAME_BYTES):
+        pass
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             planes = {
@@ -145,13 +147,3 @@ def _planes(
         name: plane if plane.dtype == np.float16 else plane.astype(np.float32)
         for name, plane in planes.items()
     }
-
-
-def _bytes(path: str | Path, *, count: int = -1) -> bytes:
-    try:
-        with Path(path).open("rb") as file:
-            return file.read(count)
-    except OSError as error:
-        raise InputError(
-            Fault(str(path), "file must be readable", error.strerror or str(error))
-        ) from None

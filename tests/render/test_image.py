@@ -91,7 +91,7 @@ def test_read_exr__absent_and_truncated_are_the_users_mistakes(
     tmp_path: Path, radiance: np.ndarray
 ) -> None:
     with pytest.raises(
-        InputError, match=r"nowhere\.exr: file must be readable; found No such file"
+        InputError, match=r"nowhere\.exr: the file must exist; found no such file"
     ):
         read_exr(tmp_path / "nowhere.exr")
     write_exr(tmp_path / "a.exr", radiance)

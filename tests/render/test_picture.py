@@ -369,5 +369,5 @@ def test_render_picture__an_exr_says_what_it_holds(
     assert names == ("R", "G", "B", "A", "variance.B", "variance.G", "variance.R")
     assert (pixels[..., 3] == 1).any()
     assert (pixels[pixels[..., 3] == 1][:, 4:] > 0).all()
-    with pytest.raises(InputError, match="must be readable"):
+    with pytest.raises(InputError, match="the file must exist"):
         render_picture(model, tmp_path / "a.exr", environment=tmp_path / "none.exr")
