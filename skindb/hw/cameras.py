@@ -238,10 +238,5 @@ def _assignment(times: Float64, due: Float64, reach: float) -> Index | None:
 
 def _nearest(times: Float64, due: Float64, reach: float) -> Index:
     """Index of the frame nearest to each due time within reach, -1 if there is none."""
-    right = np.clip(np.searchsorted(times, due), 1, max(len(times) - 1, 1))
-    before = right - 1
-    right = np.minimum(right, len(times) - 1)
-    index = np.where(
-        np.abs(times[before] - due) <= np.abs(times[right] - due), before, right
-    )
+    index = np.searchsorted((times[:-1] + times[1:]) / 2, due)
     return np.where(np.abs(times[index] - due) < reach, index, -1)

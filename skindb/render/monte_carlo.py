@@ -332,26 +332,17 @@ class _Painter:
         points = surface.vertices
         normals = surface.normals
         received = np.zeros((len(points), 3))
-        if self.lighting.lights is not None and len(self.lighting.lights):
-            received += self._received_from_lights(
-                points, normals, self.lighting.lights, rng
-            )
+        if (lights := self.lighting.lights) is not None:
+            for i in range(len(lights)):
+                place = points_on_discs(lights, np.full(len(points), i), rng)
+                light = received_light(
+                    lights, i, place, points, normals, self.scene, surface.eta
+                )
+                received += light[:, None] * lights.intensity[i]
         if self.lighting.environment is not None:
             received += self._received_from_environment(
                 points, normals, self.lighting.environment, rng
             )
-        return received
-
-    def _received_from_lights(
-        self, points: Array, normals: Array, lights: Lights, rng: np.random.Generator
-    ) -> Array:
-        received = np.zeros((len(points), 3))
-        for i in range(len(lights)):
-            place = points_on_discs(lights, np.full(len(points), i), rng)
-            light = received_light(
-                lights, i, place, points, normals, self.scene, self.surface.eta
-            )
-            received += light[:, None] * lights.intensity[i]
         return received
 
     def _received_from_environment(

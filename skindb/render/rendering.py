@@ -17,7 +17,7 @@ from skindb.geometry.rays import RayScene
 from skindb.parameters import RenderParameters
 from skindb.render.image import auto_exposure, tone_map, write_exr, write_png
 from skindb.render.monte_carlo import Lighting, Quality, Rendering, render_monte_carlo
-from skindb.render.plan import KEPT, plan_scene
+from skindb.render.plan import KEPT, ScenePlan, plan_scene
 from skindb.render.scene import (
     Camera,
     Environment,
@@ -40,8 +40,7 @@ from skindb.render.shading import (
     tree_opening,
 )
 from skindb.schema.consent import honour_consent
-from skindb.schema.notes import Omission
-from skindb.types import Float32, Mask, Progress, dots, lengths
+from skindb.types import Float32, Progress, dots, lengths
 
 UNITS = "radiance"  # in the unit of the photographs, or of the environment
 NO_LIGHTS = Lights(
@@ -143,19 +142,14 @@ def _index(names: list[str], name: str, device: str) -> int:
 
 @dataclass(frozen=True)
 class RenderInputs:
-    """Surface, camera and light of a picture, without the parts that do not change it,
-    and a list of these parts.
-    """
+    """Camera, light and surface of a picture, and the plan of the parts that it needs."""
 
-    surface: Surface
+    plan: ScenePlan
     camera: Camera
-    lighting: Lighting
     scene: RayScene
     names: dict[str, Any]  # names of camera, lights and environment
-    pixels: Mask
     # with the lights that do not reach the visible part, which count for exposures
     given: Lighting
-    omissions: tuple[Omission, ...]
 
 
 def render(
@@ -237,20 +231,20 @@ def render(
     )
     quality = Quality(samples, error, subsurface, tuple(terms), tree_opening(error)[0])
     rendering = render_monte_carlo(
-        inputs.surface,
+        inputs.plan.surface,
         inputs.camera,
-        inputs.lighting,
+        inputs.plan.lighting,
         quality,
         rng=np.random.default_rng(seed),
         scene=inputs.scene,
-        pixels=inputs.pixels,
+        pixels=inputs.plan.pixels,
         progress=progress,
     )
     attrs = inputs.names | {
         "samples": rendering.samples,
         "relative_error": rendering.relative_error,
         "seconds": rendering.seconds,
-        "skipped": [str(omission) for omission in inputs.omissions],
+        "skipped": [str(omission) for omission in inputs.plan.omissions],
     }
     return _labelled(rendering).assign_attrs(attrs)
 
@@ -303,16 +297,7 @@ def render_inputs(
     plan = plan_scene(
         surface, sized, lighting, scene, subsurface=subsurface, error=error
     )
-    return RenderInputs(
-        plan.surface,
-        sized,
-        plan.lighting,
-        scene,
-        names,
-        plan.pixels,
-        lighting,
-        plan.omissions,
-    )
+    return RenderInputs(plan, sized, scene, names, lighting)
 
 
 def _chosen_lighting(
@@ -389,7 +374,7 @@ def render_picture(
         inputs = render_inputs(
             model, **view, subsurface=settings["subsurface"], error=settings["error"]
         )
-        skipped = [str(omission) for omission in inputs.omissions]
+        skipped = [str(omission) for omission in inputs.plan.omissions]
         return {"path": str(out), **inputs.names, "skipped": skipped, "kept": KEPT}
     seen = render(model, **settings)
     summary = {"path": str(out)} | {
