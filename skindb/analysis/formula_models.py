@@ -73,6 +73,7 @@ class MixedModel:
     fixed: str  # terms, as of formulaic
     slopes: tuple[str, ...] = ()  # numbers whose slopes differ between subjects
     is_mixed: bool = False  # whether subjects have intercepts of their own
+    nested: str = ""  # column whose values have intercepts of their own in each subject
 
     @classmethod
     def of(cls, formula: str) -> MixedModel:
@@ -86,19 +87,21 @@ class MixedModel:
             "must have one ~ between a quantity and terms": not separator
             or "~" in right,
             f"must begin with one of {', '.join(MODELLED)}": quantity not in MODELLED,
-            "has at most one random part, (1 | subject) or (1 + NAME | subject)": len(
-                random
-            )
-            > 1,
+            "has at most one random part, (1 | subject), (1 + NAME | subject) or "
+            "(1 | subject/NAME)": len(random) > 1,
             "has the terms NAME, C(NAME), 0 and 1, joined by + - * : / ( )": not TERMS.fullmatch(
                 fixed
             ),
         }
         slopes: list[str] = []
+        nested = ""
         for effects, group in random:
             slopes = [part.strip() for part in effects.split("+")]
             slopes = [part for part in slopes if part != "1"]
-            faults["has random effects of subjects alone"] = group.strip() != SUBJECT
+            outer, is_nested, nested = (part.strip() for part in group.partition("/"))
+            faults["has random effects of subjects, or of NAME within subjects"] = (
+                outer != SUBJECT or bool(is_nested and not re.fullmatch(NAME, nested))
+            )
             faults["has random effects 1 and NAME"] = not all(
                 re.fullmatch(NAME, part) for part in slopes
             )
@@ -110,6 +113,7 @@ class MixedModel:
             fixed,
             tuple(part.strip("`") for part in slopes),
             bool(random),
+            nested.strip("`"),
         )
 
 
@@ -128,8 +132,9 @@ def linear_model(
         ``db.cohort("tables")``.
     formula
         Quantity, or its logarithm ``log(NAME)``, ``~`` and terms of attributes, condition
-        and visit, as of formulaic; perhaps with ``(1 | subject)``, or with ``(1 + NAME |
-        subject)`` for slopes that differ between subjects. Takes in other conditions
+        and visit, as of formulaic; perhaps with ``(1 | subject)``, with ``(1 + NAME |
+        subject)`` for slopes that differ between subjects, or with ``(1 | subject/NAME)``
+        for values of NAME that differ within them. Takes in other conditions
         than normal are used if the formula names the condition. `baseline` is the value
         of the subject's first take in the condition normal, which is no row then; its
         logarithm if that of the quantity is explained.
@@ -146,9 +151,10 @@ def linear_model(
         (quantity, term), see the variables of the group "linear_model": estimates by restricted
         maximum likelihood (statsmodels' MixedLM; least squares without a random part),
         Student's intervals and p values with the degrees of freedom between subjects
-        for terms that are constant within subjects or have random slopes, and within
-        subjects for others. Terms of one number are per unit of it, those of words less
-        the first word in the alphabet; contrasts follow them. Attribute "flags".
+        for terms that are constant within subjects or have random slopes, within
+        subjects for others, and between nested values for those constant within them.
+        Terms of one number are per unit of it, those of words less the first word in
+        the alphabet; contrasts follow them. Attribute "flags".
 
     Raises
     ------
@@ -214,7 +220,7 @@ class _Fit:
 
 def _names(model: MixedModel, known: Sequence[str]) -> list[str]:
     """Columns that a model uses."""
-    names = sorted({*_words(model), *model.slopes, SUBJECT})
+    names = sorted({*_words(model), *model.slopes, SUBJECT, model.nested or SUBJECT})
     if unknown := [name for name in names if name not in known]:
         raise input_error(
             f"formula: {', '.join(unknown)}",
@@ -265,11 +271,11 @@ def _fit(
     subjects = rows[SUBJECT].to_numpy(str)
     people = len(set(subjects))
     x, terms, of_slopes = design_of(model, rows)
-    is_between = is_constant_within(x, subjects) | np.isin(terms, of_slopes)
-    within = len(rows) - people - int((~is_between).sum())
-    free = np.where(is_between, people - is_between.sum(), within).astype(float)
-    if not model.is_mixed:
-        free = np.full(len(terms), float(len(rows) - len(terms)))
+    groups = [subjects] if model.is_mixed else []
+    if model.nested:
+        cells = rows.groupby([SUBJECT, model.nested], observed=True).ngroup()
+        groups.append(cells.to_numpy())
+    free = _degrees_of_freedom(x, groups, np.isin(terms, of_slopes))
     require(
         free.min() > 0 and np.linalg.matrix_rank(x) == len(terms),
         "formula",
@@ -288,6 +294,12 @@ def _fit(
         "must have (1 | subject) only if subjects have several takes",
         f"one take of each of {people} subjects",
     )
+    require(
+        all(people < len(set(cells)) < len(rows) for cells in groups[1:]),
+        "formula",
+        "must have (1 | subject/NAME) only if values of NAME have several takes",
+        f"one {model.nested} of each subject, or one take of each {model.nested}",
+    )
     y = rows["value"].to_numpy(float)
     require(
         np.ptp(y) > ROUNDING * np.abs(y).max(),
@@ -299,14 +311,15 @@ def _fit(
     random = np.column_stack(
         [np.ones(len(rows)), *(_numbers(rows, name) for name in model.slopes)]
     )
-    estimate, covariance, spread = _solve(
-        y / scale, x, subjects, random if model.is_mixed else None
-    )
+    estimate, covariance, spread = _solve(y / scale, x, groups, random)
     table = _inference(
         (scale * estimate, scale**2 * covariance, free), terms, contrasts, margin
     )
     effects = [INTERCEPT, *model.slopes] if model.is_mixed else []
     size = np.sqrt((random**2).mean(axis=0))  # whatever the units of the slopes are
+    if model.nested:
+        effects.append(model.nested)
+        size = np.append(size, 1.0)
     at_bound = [
         effect
         for effect, value in zip(effects, spread[:-1] * size, strict=True)
@@ -319,6 +332,18 @@ def _fit(
         people,
         tuple(f"no variance of {effect} between subjects" for effect in at_bound),
     )
+
+
+def _degrees_of_freedom(x: Array, groups: Sequence[Array], of_slopes: Mask) -> Array:
+    """Degrees of freedom (p,) of columns x (n, p): those between the outermost groups in
+    which a column is constant, or between rows.
+    """
+    counts = [0, *(len(set(labels)) for labels in groups), len(x)]
+    varies = [~is_constant_within(x, labels) for labels in groups]
+    level = np.sum(varies, axis=0, dtype=int) * np.ones(x.shape[1], int)
+    level[of_slopes] = 0
+    terms = np.bincount(level, minlength=len(counts) - 1)
+    return np.asarray((np.diff(counts) - terms)[level], float)
 
 
 def design_of(
@@ -359,16 +384,23 @@ def is_constant_within(x: Array, subjects: Array) -> Mask:
 
 
 def information_of(
-    x: Array, random: Array, subjects: Array, between: Array, variance: float
+    x: Array,
+    random: Array,
+    groups: Sequence[Array],
+    between: Array,
+    variances: Sequence[float],
 ) -> Array:
     """Inverse covariance (p, p) of the fixed effects of columns x (n, p) for columns
-    random (n, q), their covariance between subjects (q, q), and a residual variance.
+    random (n, q), their covariance between subjects (q, q), which are the first of the
+    groups, and the variances of the other groups and of the residual.
     """
     information = np.zeros((x.shape[1],) * 2)
-    for subject in dict.fromkeys(subjects.tolist()):
-        rows = subjects == subject
+    for subject in dict.fromkeys(groups[0].tolist()):
+        rows = groups[0] == subject
         covariance = random[rows] @ between @ random[rows].T
-        covariance += variance * np.eye(len(covariance))
+        labels = [*(cells[rows] for cells in groups[1:]), np.arange(rows.sum())]
+        for cells, variance in zip(labels, variances, strict=True):
+            covariance += variance * (cells[:, None] == cells)
         information += x[rows].T @ np.linalg.solve(covariance, x[rows])
     return information
 
@@ -430,17 +462,17 @@ def _numbers(rows: pd.DataFrame, name: str) -> Array:
 
 
 def _solve(
-    y: Array, x: Array, subjects: Array, random: Array | None
+    y: Array, x: Array, groups: Sequence[Array], random: Array
 ) -> tuple[Array, Array, Array]:
     """Estimates (p,), their covariance (p, p), and standard deviations of the random
-    effects and of the residual.
+    effects of the first groups, of the other ones, and of the residual.
     """
-    if random is None:
+    if not groups:
         estimate = np.linalg.lstsq(x, y, rcond=None)[0]
         variance = float(((y - x @ estimate) ** 2).sum()) / (len(y) - x.shape[1])
         return estimate, variance * np.linalg.inv(x.T @ x), np.sqrt([variance])
     # takes a second to import
-    from statsmodels.regression.mixed_linear_model import MixedLM
+    from statsmodels.regression.mixed_linear_model import MixedLM, VCSpec
 
     # solvers with gradients stop early at bounds, and others for columns of unlike size
     x, of_x = np.linalg.qr(x)
@@ -448,15 +480,23 @@ def _solve(
     scale = np.sqrt(len(y))
     x, random = scale * x, scale * random
     back, back_random = (scale * np.linalg.inv(part) for part in (of_x, of_random))
+    subjects, *others = groups
+    nested = None
+    if others:
+        labels = [others[0][subjects == subject] for subject in np.unique(subjects)]
+        indicators = [np.equal.outer(cells, np.unique(cells)) for cells in labels]
+        names = [[*map(str, range(columns.shape[1]))] for columns in indicators]
+        nested = VCSpec(["nested"], [names], [[1.0 * one for one in indicators]])
     with warnings.catch_warnings():
         # a variance at its bound 0, which is reported
         warnings.simplefilter("ignore")
-        fitted = MixedLM(y, x, groups=subjects, exog_re=random).fit(method="powell")
-    variance = float(fitted.scale)
+        model = MixedLM(y, x, groups=subjects, exog_re=random, exog_vc=nested)
+        fitted = model.fit(method="powell")
+    variances = [*map(float, fitted.vcomp), float(fitted.scale)]
     between = np.atleast_2d(np.asarray(fitted.cov_re, float))
-    information = information_of(x, random, subjects, between, variance)
+    information = information_of(x, random, groups, between, variances)
     between = back_random @ between @ back_random.T
-    spread = np.sqrt([*np.maximum(np.diag(between), 0), variance])
+    spread = np.sqrt([*np.maximum(np.diag(between), 0), *variances])
     estimate = back @ np.asarray(fitted.fe_params, float)
     return estimate, back @ np.linalg.inv(information) @ back.T, spread
 

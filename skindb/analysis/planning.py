@@ -98,9 +98,9 @@ def sample_sizes(
     """
     model = MixedModel.of(formula)
     require(
-        model.is_mixed and not model.slopes,
+        model.is_mixed and not model.slopes and not model.nested,
         f"formula {formula}",
-        "must have (1 | subject), without slopes",
+        "must have (1 | subject), without slopes or nesting",
         "another random part",
     )
     rows = _design(visits, design)
@@ -121,8 +121,8 @@ def sample_sizes(
     needed, errors = [], []
     for between, within in deviations.values:
         subjects = rows[SUBJECT].to_numpy()
-        variances = (np.full((1, 1), between**2), within**2)
-        information = information_of(x, np.ones((len(rows), 1)), subjects, *variances)
+        variances = (np.full((1, 1), between**2), [within**2])
+        information = information_of(x, np.ones((len(rows), 1)), [subjects], *variances)
         variance = factors @ np.linalg.solve(information, factors)
         error = np.sqrt(variance * PEOPLE / counts)
         enough = np.flatnonzero(_power(effect / error, free) >= power)

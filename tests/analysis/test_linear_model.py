@@ -101,6 +101,44 @@ def test_linear_model__units_and_origin_of_a_slope_change_no_inference(unit, sta
     assert fits[0].flags == fits[1].flags == ()
 
 
+@pytest.mark.filterwarnings("ignore:Random effects covariance is singular")
+def test_linear_model__of_nested_effects_has_the_numbers_of_statsmodels():
+    """Visits differ within subjects, and have two repeats; as in
+    `test_linear_model__has_the_numbers_of_statsmodels`.
+    """
+    rng = np.random.default_rng(4)
+    rows = pd.DataFrame(
+        {
+            "subject": np.repeat([f"S{i:02d}" for i in range(16)], 6),
+            "visit": np.tile(np.repeat([1, 2, 3], 2), 16),
+            "group": np.repeat(np.arange(16) % 2, 6),
+            "side": np.tile([0.0, 1.0], 48),
+        }
+    )
+    value = rng.normal(0, 1, 16).repeat(6) + rng.normal(0, 0.7, 48).repeat(2)
+    rows["value"] = value + rng.normal(0, 0.5, 96)
+    ours = _fit(MixedModel.of("R_d ~ group + visit + side + (1 | subject/visit)"), rows)
+    theirs = smf.mixedlm(
+        "value ~ group + visit + side",
+        rows,
+        groups="subject",
+        re_formula="1",
+        vc_formula={"visit": "0 + C(visit)"},
+    ).fit(method="powell")
+    terms = ours.table.index
+    error = theirs.bse_fe[terms]
+    np.testing.assert_allclose(ours.table["model_error"], error, rtol=0.03)
+    assert (
+        np.abs(ours.table["model_estimate"] - theirs.fe_params[terms]) < 1e-3 * error
+    ).all()
+    expected = np.sqrt([theirs.cov_re.iloc[0, 0], theirs.vcomp[0], theirs.scale])
+    np.testing.assert_allclose([*ours.deviation.values()], expected, rtol=0.01)
+    assert [*ours.deviation] == ["Intercept", "visit", "residual"]
+    # 16 subjects, 48 visits, 96 takes
+    free = ours.table["model_degrees_of_freedom"]
+    assert free.to_dict() == {"Intercept": 14, "group": 14, "visit": 31, "side": 47}
+
+
 def test_linear_model__degrees_of_freedom_by_hand():
     table = linear_model(planted(), formula=FORMULA).isel(quantity=0)
     free = dict(
@@ -250,8 +288,13 @@ def test_linear_model__no_variance_between_subjects_is_flagged():
             "R_d ~ height + (1 | subject)",
             "height: must be columns .* choose from: subject",
         ),
-        ("R_d ~ age + (1 | site)", "random effects of subjects alone"),
-        ("R_d ~ age + (1 | subject/visit)", "random effects of subjects alone"),
+        ("R_d ~ age + (1 | site)", "random effects of subjects, or of NAME within"),
+        (
+            "R_d ~ age + (1 | subject/2)",
+            "random effects of subjects, or of NAME within",
+        ),
+        ("R_d ~ age + (1 | subject/site)", "site: must be columns"),
+        ("R_d ~ age + (1 | subject/visit)", "one take of each visit"),
         (
             "R_d ~ age + (1 | subject) + (0 + visit | subject)",
             "at most one random part",

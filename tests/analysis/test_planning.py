@@ -75,7 +75,10 @@ def test_sample_sizes__too_small_an_effect_has_no_number(cohort):
     ("options", "said"),
     [
         ({"formula": "R_d ~ treatment"}, "must have .1 . subject."),
-        ({"formula": "R_d ~ treatment + (1 + visit | subject)"}, "without slopes"),
+        (
+            {"formula": "R_d ~ treatment + (1 + visit | subject)"},
+            "without slopes or nesting",
+        ),
         ({"visits": 1}, "must be determined by the design"),
         ({"term": "dose"}, "not a sum of multiples of Intercept, treatment"),
         ({"formula": "R_d ~ age + (1 | subject)"}, "must fit the data"),
