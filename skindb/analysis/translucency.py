@@ -14,7 +14,11 @@ from skindb.analysis.contrasts import FEW
 from skindb.analysis.quantities import trusted
 from skindb.analysis.study import Population, Results, Study, table_of
 from skindb.analysis.subjects import Groups, grouped
-from skindb.numerics.statistics import SUMMARY, known_mean, variance_components
+from skindb.numerics.statistics import (
+    SUMMARY,
+    intraclass_correlation,
+    known_mean,
+)
 from skindb.parameters import group_option
 from skindb.schema import ProbeStatus, dataset, variables
 from skindb.schema.cohort import require_comparable
@@ -65,8 +69,8 @@ def translucency_table(cohort: Dataset, *, group_by: str | None = None) -> Datas
         variance that the noise of the fibres does not explain: differences between
         people and, because the probe is never placed identically, within people.
         `sigma_tr_repeat_deviation` is the standard deviation between the takes of one
-        subject, from subjects with several takes in a group (restricted maximum
-        likelihood). The intervals do not include model errors that are common to all
+        subject, from the pooled variance of subjects with several takes in a group. The
+        intervals do not include model errors that are common to all
         takes. Attribute "statuses": number of profiles of each status.
 
     Raises
@@ -151,9 +155,8 @@ def _repeat_deviation(values: Array, subjects: NDArray[np.str_]) -> Array:
         is_known = np.isfinite(values[:, *index])
         people = len(set(subjects[is_known].tolist()))
         if people >= 2 and is_known.sum() > people:
-            out[index] = np.sqrt(
-                variance_components(values[is_known, *index], subjects[is_known])[2]
-            )
+            repeats = values[is_known, *index]
+            out[index] = intraclass_correlation(repeats, subjects[is_known]).within
     return out
 
 

@@ -581,23 +581,16 @@ def _distance_ratio(step: Array, error: Array) -> Array:
     return np.divide(square, error, out=exact, where=error > 0)
 
 
-def _arrangements(sizes: Sequence[int]) -> Iterator[Index]:
+def _arrangements(sizes: Sequence[int]) -> Iterator[tuple[int, ...]]:
     """Every distinct order of labels, by the number of labels of each group; the first
     is sorted.
     """
-
-    def arranged(labels: Index, free: Index, g: int) -> Iterator[Index]:
-        if g == len(sizes) - 1:
-            labels[free] = g
-            yield labels.copy()
-            return
-        for places in combinations(free.tolist(), sizes[g]):
-            following = labels.copy()
-            following[list(places)] = g
-            yield from arranged(following, np.setdiff1d(free, places), g + 1)
-
-    n = sum(sizes)
-    yield from arranged(np.zeros(n, np.intp), np.arange(n), 0)
+    if not any(sizes):
+        yield ()
+    for g, size in enumerate(sizes):
+        if size > 0:
+            rest = [*sizes[:g], size - 1, *sizes[g + 1 :]]
+            yield from ((g, *labels) for labels in _arrangements(rest))
 
 
 def _orders(present: Mask) -> Index:

@@ -1,5 +1,5 @@
 """Statistics of populations: mergeable moments, intervals, false discoveries, power, and
-variance components; the unit of observation is a subject.
+correlations within subjects; the unit of observation is a subject.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import optimize, stats
+from scipy import stats
 
 from skindb.types import AnyArray, Array, float64
 
@@ -191,52 +191,3 @@ def agreement_correlation(values: Array) -> tuple[float, float, float]:
         low = n * (between - upper * error) / (upper * others + n * between)
         high = n * (lower * between - error) / (others + n * lower * between)
     return float(icc), float(low), float(high)
-
-
-def variance_components(values: Array, subject: AnyArray) -> tuple[float, float, float]:
-    """Mean, variance between subjects and variance of repeats of one subject, by
-    restricted maximum likelihood.
-
-    Parameters
-    ----------
-    values
-        (n,) finite.
-    subject
-        (n,) subject of each value; at least two subjects, one of them with two values.
-    """
-    _, member, count = np.unique(subject, return_inverse=True, return_counts=True)
-    n = len(values)
-    if len(count) < 2 or n == len(count):
-        raise ValueError(
-            "variance components must come from two subjects or more, one of them with two values"
-        )
-    if np.ptp(values) <= ROUNDING * np.abs(values).max():
-        return float(values.mean()), 0.0, 0.0
-    mean = np.bincount(member, values) / count
-    within = float(((values - mean[member]) ** 2).sum())
-
-    def profile(log_ratio: float) -> tuple[float, float, float]:
-        """-2 log restricted likelihood, mean, and variance of repeats, for a ratio of
-        the two variances.
-        """
-        weight = count / (1 + count * np.exp(log_ratio))
-        centre = float(weight @ mean / weight.sum())
-        repeat = (within + float(weight @ (mean - centre) ** 2)) / (n - 1)
-        if repeat <= 0:
-            return -np.inf, centre, 0.0
-        logs = np.log1p(count * np.exp(log_ratio)).sum() + np.log(weight.sum())
-        return (n - 1) * float(np.log(repeat)) + float(logs), centre, repeat
-
-    grid = np.linspace(-12, 12, 49)  # the likelihood may have two maxima
-    start = grid[int(np.argmin([profile(log_ratio)[0] for log_ratio in grid]))]
-    log_ratio = float(
-        optimize.minimize_scalar(
-            lambda log_ratio: profile(log_ratio)[0],
-            bounds=(start - 0.5, start + 0.5),
-            method="bounded",
-        ).x
-    )
-    if start == grid[0] or profile(log_ratio)[0] >= profile(-40.0)[0]:
-        log_ratio = -np.inf  # no variance between subjects
-    _, centre, repeat = profile(log_ratio)
-    return centre, float(np.exp(log_ratio)) * repeat, repeat

@@ -7,7 +7,6 @@ from __future__ import annotations
 import hashlib
 import zipfile
 from collections.abc import Iterator, Mapping
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
 from skindb.errors import Fault, InputError, input_error
-from skindb.files import package_json, private_file
+from skindb.files import private_file
 from skindb.optics.angles import half_difference
 from skindb.reflectance.dictionary import (
     Dictionary,
@@ -30,7 +29,7 @@ from skindb.reflectance.tables import (
     directional_albedo,
     lookup,
 )
-from skindb.types import AnyArray, Array, Index, float64
+from skindb.types import AnyArray, Array, float64
 
 TABLE = "basis_brdf"
 NODES = ANGLES
@@ -39,9 +38,6 @@ UNITS = ("sr-1", "sr^-1", "1/sr")
 MAX_HOLE_FRACTION = 0.5
 SHAPE = (90, 90, 180)  # theta_h (quadratic), theta_d, phi_d
 SCALE = np.array([1.0, 1.15, 1.66]) / 1500.0
-GENUINE = "genuine"
-DIFFERS = "differs from the published file of that name"
-UNKNOWN = "not in the published set"
 Nodes = tuple[Array, Array, Array]  # theta_h, theta_d, phi_d [rad]
 
 
@@ -84,9 +80,7 @@ def read_tables(path: str | Path) -> Dictionary:
     nodes = (arrays["theta_h"], arrays["theta_d"], arrays["phi_d"])
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     resampled = [
-        to_default_grid(
-            _channel_mean(brdf_of_material), nodes, "a file of tables", digest
-        )
+        to_default_grid(_channel_mean(brdf_of_material), nodes, digest)
         for brdf_of_material in brdf
     ]
     table = np.stack([table for table, _ in resampled], axis=-1)
@@ -358,9 +352,9 @@ def read_merl_folder(path: str | Path) -> Dictionary:
     faults: list[Fault] = []
     for file in files:
         try:
-            table, origin = to_default_grid(
-                read_merl(file)[0].mean(axis=-1), nodes, *_publication_check(file)
-            )
+            brdf = read_merl(file)[0].mean(axis=-1)
+            digest = hashlib.sha256(file.read_bytes()).hexdigest()
+            table, origin = to_default_grid(brdf, nodes, digest)
         except InputError as error:
             faults.extend(error.faults)
         else:
@@ -378,38 +372,13 @@ def read_merl_folder(path: str | Path) -> Dictionary:
     )
 
 
-@cache
-def published_digests() -> dict[str, str]:
-    """SHA-256 of the hundred files of the database, version 2 of February 2006, by material.
-
-    MERL publishes no checksums. These are the Git LFS object names of the complete public
-    copy in github.com/duanwenxi/Mitsuba-3-for-Photometric-Stereo-data, commit
-    914294a081b1ef36e56f9392c2758bca24868e3a.
-    """
-    return dict(package_json("skindb.reflectance", "merl_sha256.json"))
-
-
-def _publication_check(file: Path) -> tuple[str, str]:
-    """Whether a file is the published one, in words, and its SHA-256."""
-    with file.open("rb") as data:
-        digest = hashlib.file_digest(data, "sha256").hexdigest()
-    published = published_digests()
-    for name, value in published.items():
-        if value == digest:
-            renamed = f"published under the name {name}"
-            return GENUINE if name == file.stem else renamed, digest
-    return DIFFERS if file.stem in published else UNKNOWN, digest
-
-
-def to_default_grid(
-    brdf: Array, nodes: Nodes, check: str, sha256: str
-) -> tuple[Table, Origin]:
+def to_default_grid(brdf: Array, nodes: Nodes, sha256: str) -> tuple[Table, Origin]:
     """One material (theta_h, theta_d, phi_d) on the default grid, and its origin with
     the error of resampling.
     """
     table = to_grid(fill_holes(brdf), nodes)
     return table, Origin(
-        check, sha256, hole_fraction(brdf, nodes), _resampling_error(brdf, nodes, table)
+        sha256, hole_fraction(brdf, nodes), _resampling_error(brdf, nodes, table)
     )
 
 
@@ -428,35 +397,30 @@ def to_grid(brdf: Array, nodes: Nodes) -> Table:
     theta_d and phi_d.
     """
     grid = DEFAULT_GRID
-    same = zip(nodes, (grid.theta_h, grid.theta_d, grid.phi_d), strict=True)
+    axes = (grid.theta_h, grid.theta_d, grid.phi_d)
+    same = zip(nodes, axes, strict=True)
     if all(len(a) == len(b) and np.allclose(a, b, rtol=0, atol=1e-6) for a, b in same):
         return brdf.astype(np.float32)
-    phi, column = _periodic_nodes(nodes[2])
-    table = np.einsum(
-        "kp,hdp->hdk", _linear_matrix(phi, grid.phi_d), brdf[:, :, column]
-    )
-    table = np.einsum("jd,hdk->hjk", _linear_matrix(nodes[1], grid.theta_d), table)
-    table = np.einsum(
-        "ih,hjk->ijk", _linear_matrix(np.sqrt(nodes[0]), np.sqrt(grid.theta_h)), table
-    )
+    # constant beyond the nodes
+    inside = [np.clip(a, b[0], b[-1]) for a, b in zip(axes[:2], nodes, strict=False)]
+    angles = np.meshgrid(*inside, grid.phi_d, indexing="ij")
+    table = _interpolated(brdf, nodes, *angles)
     # phi_d is undefined where the half vector is the normal
     table[0] = table[0].mean(axis=-1, keepdims=True)
     return table.astype(np.float32)
 
 
-def _periodic_nodes(phi_d: Array) -> tuple[Array, Index]:
-    """Nodes with one more on both sides of their period pi, and the column of each."""
-    n = len(phi_d)
-    return np.concatenate([[phi_d[-1] - np.pi], phi_d, [phi_d[0] + np.pi]]), np.arange(
-        -1, n + 1
-    ) % n
-
-
-def _linear_matrix(nodes: Array, points: Array) -> Array:
-    """Matrix (len(points), len(nodes)) of linear interpolation; constant beyond the ends."""
-    return np.stack(
-        [np.interp(points, nodes, column) for column in np.eye(len(nodes))], axis=1
-    )
+def _interpolated(
+    brdf: Array, nodes: Nodes, theta_h: Array, theta_d: Array, phi_d: Array
+) -> Array:
+    """Values at angles of one shape; NaN beyond the nodes of theta_h and theta_d."""
+    n = len(nodes[2])
+    # one node more on both sides of the period pi
+    phi = np.concatenate([[nodes[2][-1] - np.pi], nodes[2], [nodes[2][0] + np.pi]])
+    axes = (np.sqrt(nodes[0]), nodes[1], phi)
+    values = brdf[:, :, np.arange(-1, n + 1) % n]
+    interpolator = RegularGridInterpolator(axes, values, bounds_error=False)
+    return np.asarray(interpolator((np.sqrt(theta_h), theta_d, phi_d)))
 
 
 def _resampling_error(brdf: Array, nodes: Nodes, table: Table) -> float:
@@ -465,11 +429,7 @@ def _resampling_error(brdf: Array, nodes: Nodes, table: Table) -> float:
     """
     wi, wo = sample_pairs()
     th, td, pd = half_difference(wi, wo)
-    phi, column = _periodic_nodes(nodes[2])
-    axes = (np.sqrt(nodes[0]), nodes[1], phi)
-    values = RegularGridInterpolator(axes, brdf[:, :, column], bounds_error=False)(
-        np.stack([np.sqrt(th), td, pd], -1)
-    )
+    values = _interpolated(brdf, nodes, th, td, pd)
     finite = np.isfinite(values)
     if not finite.any():
         return float("nan")

@@ -59,7 +59,6 @@ INCIDENCE = np.radians(np.arange(0, 86, 5))
 class Origin:
     """Provenance of the table of one material that was read from a file."""
 
-    check: str  # whether it is the published file of its name
     sha256: str
     # fraction of nodes above the horizon that were not measured and continue their
     # neighbours
@@ -113,21 +112,17 @@ class Dictionary:
         """Remarks about the files for the user, one per line."""
         if not self.origins:
             return ()
-        by_check: dict[str, list[str]] = {}
-        for name, origin in zip(self.names, self.origins, strict=True):
-            by_check.setdefault(origin.check, []).append(name)
-        lines = [f"{check}: {', '.join(names)}" for check, names in by_check.items()]
         worst, name = max(
             (origin.hole_fraction, name)
             for name, origin in zip(self.names, self.origins, strict=True)
         )
-        if worst > 0:
-            count = sum(origin.hole_fraction > 0 for origin in self.origins)
-            largest = f"most in {name} ({worst:.2%} of its nodes)"
-            lines.append(
-                f"materials with unmeasured nodes above the horizon: {count}, {largest}"
-            )
-        return tuple(lines)
+        if not worst > 0:
+            return ()
+        count = sum(origin.hole_fraction > 0 for origin in self.origins)
+        return (
+            f"materials with unmeasured nodes above the horizon: {count}, "
+            f"most in {name} ({worst:.2%} of its nodes)",
+        )
 
 
 @cache

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,13 +13,7 @@ from skindb.numerics.statistics import (
     Moments,
     bootstrap_interval,
     detectable_difference,
-    variance_components,
 )
-
-
-@pytest.fixture(scope="module")
-def statsmodels():
-    return pytest.importorskip("statsmodels.api")
 
 
 @settings(max_examples=40)
@@ -71,26 +63,3 @@ def test_detectable_difference__is_found_as_often_as_stated():
     power = np.mean(np.abs(statistic) > stats.t.ppf(0.975, n - 2))
     # three standard errors of 2,000 trials, and the t approximation
     assert power == pytest.approx(0.8, abs=0.04)
-
-
-@pytest.mark.parametrize("repeats", ["balanced", "unbalanced"])
-@pytest.mark.parametrize("between", [0.0, 0.3, 2.0])
-def test_variance_components__are_those_of_statsmodels(statsmodels, repeats, between):
-    rng = np.random.default_rng([int(10 * between), len(repeats)])
-    subject = np.repeat(
-        np.arange(25), 3 if repeats == "balanced" else rng.integers(1, 5, 25)
-    )
-    values = (
-        5
-        + rng.normal(0, np.sqrt(between), 25)[subject]
-        + rng.normal(0, 1, len(subject))
-    )
-    mean, people, repeat = variance_components(values, subject)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # for no variance between subjects
-        oracle = statsmodels.MixedLM(values, np.ones(len(values)), subject).fit(
-            reml=True
-        )
-    np.testing.assert_allclose(mean, oracle.fe_params[0], rtol=1e-4)
-    np.testing.assert_allclose(repeat, oracle.scale, rtol=2e-3)
-    np.testing.assert_allclose(people, float(oracle.cov_re[0, 0]), rtol=1e-2, atol=5e-3)

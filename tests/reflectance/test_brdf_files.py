@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import re
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +12,6 @@ from skindb.errors import InputError
 from skindb.optics.angles import half_difference
 from skindb.reflectance.brdf_files import (
     SHAPE,
-    published_digests,
     read_dictionary,
     read_merl,
     read_merl_folder,
@@ -23,7 +20,7 @@ from skindb.reflectance.brdf_files import (
     write_merl,
     write_tables,
 )
-from skindb.reflectance.dictionary import Dictionary, abc_parameters, convolve_disc
+from skindb.reflectance.dictionary import Dictionary, convolve_disc
 from skindb.reflectance.tables import DEFAULT_GRID, tabulate
 
 
@@ -94,50 +91,6 @@ def test_read_merl_folder__all_damaged_files_at_once(tmp_path):
     ]
 
 
-def test_read_merl_folder__says_which_files_are_the_published_ones(
-    tmp_path, monkeypatch
-):
-    """Four files: the published one, a changed one of such a name, one under another
-    name, a name of the user.
-    """
-    for name, value in (
-        ("teflon", 1.0),
-        ("delrin", 0.1),
-        ("mine", 0.2),
-        ("white-paint", 0.3),
-    ):
-        write_merl(tmp_path / f"{name}.binary", np.full((*SHAPE, 3), value))
-    sums = {
-        name: hashlib.sha256((tmp_path / f"{name}.binary").read_bytes()).hexdigest()
-        for name in ("teflon", "mine")
-    }
-    monkeypatch.setitem(published_digests(), "teflon", sums["teflon"])
-    monkeypatch.setitem(published_digests(), "ipswich-pine-221", sums["mine"])
-    found = read_merl_folder(tmp_path)
-    checks = {
-        name: origin.check
-        for name, origin in zip(found.names, found.origins, strict=True)
-    }
-    assert checks == {
-        "teflon": "genuine",
-        "delrin": "differs from the published file of that name",
-        "mine": "published under the name ipswich-pine-221",
-        "white-paint": "differs from the published file of that name",
-    }
-    assert (
-        "differs from the published file of that name: delrin, white-paint"
-        in found.notes
-    )
-    assert found.origins[found.names.index("teflon")].sha256 == sums["teflon"]
-
-
-def test_sha256__of_the_hundred_materials():
-    digests = published_digests()
-    assert len(digests) == len(set(digests.values())) == 100
-    assert set(abc_parameters()) < set(digests)
-    assert all(re.fullmatch("[0-9a-f]{64}", value) for value in digests.values())
-
-
 def test_read_merl_folder__counts_holes_above_the_horizon_only(tmp_path):
     """A tenth of the bins of phi_d, at every theta_h below 20 degrees and theta_d below
     45: all above the horizon.
@@ -166,7 +119,7 @@ def test_read_merl_folder__counts_holes_above_the_horizon_only(tmp_path):
     assert found.origins[0].hole_fraction == pytest.approx(
         42 * 45 * 18 / above, rel=1e-6
     )
-    assert found.notes[1].startswith(
+    assert found.notes[0].startswith(
         "materials with unmeasured nodes above the horizon: 1, most in a ("
     )
 
