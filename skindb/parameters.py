@@ -180,7 +180,7 @@ def broken_rule(limits: Option, hint: Any, value: Any) -> str:
         return ""
     if words:
         return f"must be {', '.join(words)}, or a number from {_short(low)} to {_short(high)}"
-    if high is None or high == MAX_SEED:
+    if high is None:
         return f"must be at least {low:g}"
     return f"must lie in {'(' if limits.above_minimum else '['}{low:g}, {high:g}]"
 

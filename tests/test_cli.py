@@ -115,7 +115,11 @@ def test_cli__every_number_has_a_largest_value():
             1,
             "width x height must be 1 to 8,000,000;",
         ),
-        (("simulate", "{tmp}", "--seed", "1" * 40), 2, "is not in the range x>=0"),
+        (
+            ("simulate", "{tmp}", "--seed", "1" * 40),
+            2,
+            "is not in the range 0<=x<=4294967295",
+        ),
         (
             ("ingest", "{tmp}", "{tmp}", "--workers", "100000"),
             2,

@@ -15,7 +15,7 @@ from click.core import ParameterSource
 
 import skindb
 from skindb.files import Json
-from skindb.limits import MAX_SEED, MAX_WAIT_S, MAX_WORKERS
+from skindb.limits import MAX_WAIT_S, MAX_WORKERS
 from skindb.parameters import DICTIONARY_HELP, Option, broken_rule, option_of, words_of
 
 DB = click.argument("db", metavar="DB")
@@ -54,16 +54,6 @@ class Finite(click.FloatRange):
         if not math.isfinite(number):
             self.fail(f"{value!r} is not a finite number.", param, ctx)
         return number
-
-
-class Seed(click.IntRange):
-    """A random seed, whose largest value is not worth a line of the help."""
-
-    def __init__(self) -> None:
-        super().__init__(0, MAX_SEED)
-
-    def _describe_range(self) -> str:
-        return "x>=0"
 
 
 class WordOrNumber(click.ParamType):  # type: ignore[type-arg]
@@ -183,8 +173,6 @@ def _type(kind: Any, limits: Option) -> Any:
         return PATH
     if kind is float:
         return Finite(limits.minimum, limits.maximum, min_open=limits.above_minimum)
-    if kind is int and limits.maximum == MAX_SEED:
-        return Seed()
     if kind is int:
         low, high = (
             None if x is None else int(x) for x in (limits.minimum, limits.maximum)

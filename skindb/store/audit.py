@@ -146,7 +146,10 @@ def read_audit(
         return [], [
             Fault(place.where(AUDIT), "must be a folder", f"a {file_type}", RESTORE)
         ]
-    numbers, faults = _listed(place)
+    numbers: list[int] = []
+    faults: list[Fault] = []
+    for block in _blocks(place):
+        numbers += collect_faults(partial(_numbers, place, block), faults) or ()
     secret = collect_faults(partial(require_secret, place), faults)
     if secret is None:
         return [], faults
@@ -174,52 +177,30 @@ def _last_number(place: Place) -> int:
     """Number of the last entry, from a list of the blocks and one of the last block; 0
     if there is none.
     """
-    for block in reversed(place.children(AUDIT, links=True)):
-        if not re.fullmatch(BLOCK_NAME, block):
-            continue
-        names = [
-            name
-            for name in place.children(f"{AUDIT}/{block}", links=True)
-            if re.fullmatch(ENTRY_NAME, name)
-        ]
-        if names:
-            return int(names[-1].removesuffix(".json"))
+    for block in reversed(_blocks(place)):
+        if numbers := _numbers(place, block):
+            return numbers[-1]
     return 0
+
+
+def _blocks(place: Place) -> list[str]:
+    """Names of the folders of entries; those that are links are refused when they are read."""
+    names = place.children(AUDIT, links=True)
+    return [name for name in names if re.fullmatch(BLOCK_NAME, name)]
+
+
+def _numbers(place: Place, block: str) -> list[int]:
+    """Numbers of the entries of a block in order; `verify` reports other names."""
+    folder = f"{AUDIT}/{block}"
+    names = place.children(folder, links=True)
+    numbers = [int(name[:9]) for name in names if re.fullmatch(ENTRY_NAME, name)]
+    return [number for number in numbers if entry_key(number).startswith(folder)]
 
 
 def _seal_of_entry(place: Place, secret: bytes, number: int) -> str:
     """Seal of an entry; empty if it cannot be read, which `read_audit` reports."""
     outcome = _outcome(place, secret, number) if number else None
     return outcome.seal if isinstance(outcome, AuditEntry) else ""
-
-
-def _listed(place: Place) -> tuple[list[int], list[Fault]]:
-    """Numbers of all entries in order, and faults of names that are not those of entries."""
-    numbers: list[int] = []
-    faults: list[Fault] = []
-    for block in place.children(AUDIT, links=True):
-        folder = f"{AUDIT}/{block}"
-        if not re.fullmatch(BLOCK_NAME, block) or place.file_type(folder) != "folder":
-            faults.append(_unknown_fault(place, folder))
-            continue
-        for name in place.children(folder, links=True):
-            number = (
-                int(name.removesuffix(".json")) if re.fullmatch(ENTRY_NAME, name) else 0
-            )
-            if number and f"{folder}/{name}" == entry_key(number):
-                numbers.append(number)
-            else:
-                faults.append(_unknown_fault(place, f"{folder}/{name}"))
-    return numbers, faults
-
-
-def _unknown_fault(place: Place, key: str) -> Fault:
-    return Fault(
-        place.where(key),
-        "the audit log must contain only its entries",
-        "an unknown name",
-        "remove it",
-    )
 
 
 def _outcome(place: Place, secret: bytes, number: int) -> AuditEntry | Fault:
@@ -253,22 +234,14 @@ def _chain_faults(
     expected = 1
     for number in numbers:
         if number > expected:
-            missing = (
-                f"entry {expected}"
-                if number == expected + 1
-                else f"entries {expected} to {number - 1}"
-            )
-            yield Fault(
-                place.where(AUDIT), f"{missing} must exist", "no such file", RESTORE
-            )
+            rule = f"entry {expected} must exist"
+            if number > expected + 1:
+                rule = f"entries {expected} to {number - 1} must exist"
+            yield Fault(place.where(AUDIT), rule, "no such file", RESTORE)
         expected = number + 1
         entry = entries.get(number)
         before = entries.get(number - 1)
-        if (
-            entry is not None
-            and before is not None
-            and entry.previous not in ("", before.seal)
-        ):
+        if entry and before and entry.previous not in ("", before.seal):
             yield Fault(
                 place.where(entry_key(number)),
                 f"entry {number} must follow the entry before it",

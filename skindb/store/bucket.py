@@ -50,7 +50,7 @@ from skindb.store.verified import ListedStore, limits
 T = TypeVar("T")
 # before a request is repeated whose answer was lost and that obstore does not repeat
 PAUSES_S = (0.2, 1.0, 5.0)
-METADATA = "/zarr.json"
+METADATA = "zarr.json"
 FETCH_BYTES = 1 << 23  # read at a time while a digest is computed
 
 
@@ -442,10 +442,8 @@ class Bucket:
 
 
 class BucketStore(ListedStore):
-    """A version that is being written, as a zarr store.
-
-    In the process that created it, existing objects are known without requests. A copy
-    in another process, which must write different objects, asks the bucket.
+    """A version that is being written, as a zarr store; which objects exist is known
+    without requests.
 
     Parameters
     ----------
@@ -457,7 +455,6 @@ class BucketStore(ListedStore):
         super().__init__(read_only=False)
         self.bucket = bucket
         self.key = key
-        self.is_copy = False
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, BucketStore) and (self.bucket.name, self.key) == (
@@ -466,9 +463,6 @@ class BucketStore(ListedStore):
         )
 
     __hash__ = object.__hash__
-
-    def __reduce__(self) -> tuple[Callable[..., BucketStore], tuple[Bucket, str]]:
-        return _copy, (self.bucket, self.key)
 
     async def get(
         self,
@@ -489,13 +483,11 @@ class BucketStore(ListedStore):
 
     async def exists(self, key: str) -> bool:
         """Whether an object exists."""
-        if not self.is_copy:
-            return self.bucket.has_written(self._of(key))
-        return await asyncio.to_thread(self.bucket.file_type, self._of(key)) == "file"
+        return self.bucket.has_written(self._of(key))
 
     async def set(self, key: str, value: Buffer) -> None:
         """Write an object, or keep it until the commit if it is metadata."""
-        if key.endswith(METADATA[1:]) and not self.is_copy:
+        if key.endswith(METADATA):
             self.bucket.write_later(self._of(key), value.to_bytes())
             return
         await asyncio.to_thread(self.bucket.write, self._of(key), value.to_bytes())
@@ -513,12 +505,6 @@ class BucketStore(ListedStore):
 
     def _of(self, key: str) -> str:
         return f"{self.key}/{key}" if key else self.key
-
-
-def _copy(bucket: Bucket, key: str) -> BucketStore:
-    store = BucketStore(bucket, key)
-    store.is_copy = True
-    return store
 
 
 def place_at(url: str) -> Place:

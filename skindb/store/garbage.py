@@ -13,8 +13,8 @@ from skindb.errors import InputError, input_error
 from skindb.limits import RESUMABLE_SECONDS
 from skindb.schema.consent import CONSENT
 from skindb.store.erasure import SCRATCH_NAME, erase_withdrawn, holdings_of
-from skindb.store.gathered import GATHERED, unneeded_blocks
-from skindb.store.lease import NUMBER, Lease, abandoned_holder, holder_of, storage_time
+from skindb.store.gathered import BLOCK_KEY, GATHERED
+from skindb.store.lease import Lease, abandoned_holder, holder_of, storage_time
 from skindb.store.log import Log, committed_logs, remove_version, takes_below
 from skindb.store.markers import Markers, read_markers
 from skindb.store.place import (
@@ -28,7 +28,7 @@ from skindb.store.record import Key, Record
 from skindb.store.verify import may_have_had_record
 
 STILL_WRITING_SECONDS = 3600.0  # newer files may belong to a run without a lease
-KEPT_BLOCK_SECONDS = 24 * 3600.0
+KEPT_BLOCK_SECONDS = 30 * 24 * 3600.0
 KEPT_KINDS = (CONSENT, RELEASE, CALIBRATION)  # kinds of which all generations are kept
 VERSION_FILE = re.compile(rf"({TIME_HEX})\.(zarr|(manifest|tables|names)\.json)")
 OF_WITHDRAWN = "it is of a withdrawn subject, or refers to one"
@@ -67,15 +67,14 @@ def find_garbage(place: Place, generations: int | None = None) -> list[Garbage]:
     markers = read_markers(place)
     garbage = [
         *_of_withdrawn_subjects(place, markers),
-        *_temporary_files(place, now),
+        *_loose_files(place, STAGING, "a temporary file of a killed writer", now),
+        *_old_blocks(place, now),
         *_scratch_folders(place, now),
-        *_unneeded_blocks(place, now),
     ]
-    for key, of_take in (("data", _unrecorded), ("leases", _abandoned_leases)):
-        for kind, take in takes_below(place, key):
-            if not markers.hides(kind, take):
-                with suppress(InputError):
-                    garbage += of_take(place, kind, take, now)
+    for kind, take in takes_below(place, "data"):
+        if not markers.hides(kind, take):
+            with suppress(InputError):
+                garbage += _unrecorded(place, kind, take, now)
     if generations is not None:
         garbage += _old_generations(place, generations, now)
     return garbage
@@ -114,9 +113,6 @@ def _required_leases(kind: str, take: str) -> tuple[tuple[str, ...], str]:
 
 def _remove_one(place: Place, item: Garbage) -> bool:
     kind, take = item.of
-    # it was replaced by the lease of this process
-    if item.key.startswith("leases/") and NUMBER.search(item.key):
-        return True
     if item.generation:
         Log(place, kind, take).remove(item.generation)
     elif item.key.endswith(".zarr"):
@@ -212,27 +208,32 @@ def _bytes_below(place: Place, key: str) -> int:
     return sum(max(count, 0) for count in place.sizes(key).values())
 
 
-def _temporary_files(place: Place, now: Clock) -> Iterator[Garbage]:
-    """Temporary files of killed writers."""
-    sizes = place.sizes(STAGING) if place.file_type(STAGING) == "folder" else {}
+def _loose_files(
+    place: Place,
+    folder: str,
+    what: str,
+    now: Clock,
+    seconds: float = STILL_WRITING_SECONDS,
+) -> Iterator[Garbage]:
+    """Files of a folder, which are kept for some seconds."""
+    sizes = place.sizes(folder) if place.file_type(folder) == "folder" else {}
     for name, size in sizes.items():
-        key = f"{STAGING}/{name}"
+        key = f"{folder}/{name}"
         if size >= 0:
-            reason = _recent_reason(place, [key], now)
-            yield Garbage(key, "a temporary file of a killed writer", size, reason)
+            yield Garbage(key, what, size, _recent_reason(place, [key], now, seconds))
 
 
-def _unneeded_blocks(place: Place, now: Clock) -> Iterator[Garbage]:
-    """Gathered tables of versions that were replaced, or that other blocks hold too."""
-    unneeded = unneeded_blocks(place)
-    sizes = place.sizes(GATHERED) if unneeded else {}
-    for key in unneeded:
-        size = sizes.get(key.removeprefix(f"{GATHERED}/"), 0)
-        # for example of a release, which the next study of it would gather again
-        reason = _recent_reason(place, [key], now, KEPT_BLOCK_SECONDS)
-        yield Garbage(
-            key, "tables that studies gathered and later ones do not need", size, reason
-        )
+def _old_blocks(place: Place, now: Clock) -> list[Garbage]:
+    """Gathered tables of which nobody knows whether a study will read them again; it
+    gathers those again that are gone.
+    """
+    what = "tables that studies gathered a month ago"
+    blocks = _loose_files(place, GATHERED, what, now, KEPT_BLOCK_SECONDS)
+    return [
+        block
+        for block in blocks
+        if not block.kept and re.fullmatch(BLOCK_KEY, block.key)
+    ]
 
 
 def _scratch_folders(place: Place, now: Clock) -> Iterator[Garbage]:
@@ -249,17 +250,6 @@ def _scratch_folders(place: Place, now: Clock) -> Iterator[Garbage]:
         else:
             reason = _recent_reason(place, [key], now)
         yield Garbage(key, "scratch files of a killed run", size, reason)
-
-
-def _abandoned_leases(
-    place: Place, kind: str, take: str, _: Clock
-) -> Iterator[Garbage]:
-    if by := abandoned_holder(place, kind, take):
-        key = f"leases/{kind}/{take}"
-        name, size = max(
-            item for item in place.sizes(key).items() if NUMBER.fullmatch(item[0])
-        )
-        yield Garbage(f"{key}/{name}", f"the lease of a killed run: {by}", size)
 
 
 def _old_generations(place: Place, generations: int, now: Clock) -> Iterator[Garbage]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import re
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -24,7 +23,7 @@ from skindb.schema.cohort import TAKE, Held, Values, combine, values_of
 from skindb.schema.variables import VARIABLES
 from skindb.store.bucket import place_at
 from skindb.store.entries import packed, read_cache, unpacked
-from skindb.store.log import RESTORE, committed_logs
+from skindb.store.log import RESTORE
 from skindb.store.markers import read_markers
 from skindb.store.place import Place, subject_of
 from skindb.store.record import AS_RECORDED, Record, intact_or_none
@@ -122,40 +121,16 @@ def table_sources(addresses: Iterable[Address]) -> list[StoredTables]:
 
 def blocks_of(place: Place, is_named: Callable[[str], bool]) -> list[str]:
     """Blocks that may hold the tables of a subject for whom `is_named` is true."""
+
+    def read(key: str) -> list[str] | None:
+        stored = intact_or_none(partial(_stored, place, key))
+        return None if stored is None else stored[TAKE].values.tolist()
+
     return [
         key
-        for key, takes in _labels(place, TAKE).items()
+        for key, takes in read_cache(place, GATHERED, read).items()
         if takes is None or any(is_named(subject_of(take)) for take in takes)
     ]
-
-
-def unneeded_blocks(place: Place) -> list[str]:
-    """Blocks that are damaged, hold a version that is not the newest of its kind and
-    take, or hold only versions that larger blocks hold too.
-    """
-    blocks = _labels(place, SEAL)
-    if not blocks:
-        return []
-    newest = {log.head().get(SEAL) for log in committed_logs(place)}
-    unneeded = []
-    held: set[str] = set()
-    for key in sorted(blocks, key=lambda key: -len(blocks[key] or ())):
-        seals = blocks[key]
-        if not seals or not seals <= newest or seals <= held:
-            unneeded.append(key)
-        else:
-            held |= seals
-    return [key for key in unneeded if re.fullmatch(BLOCK_KEY, key)]
-
-
-def _labels(place: Place, label: str) -> dict[str, set[str] | None]:
-    """Key of each block -> a label of its takes; None if it cannot be read."""
-
-    def read(key: str) -> set[str] | None:
-        stored = intact_or_none(partial(_stored, place, key))
-        return None if stored is None else {*stored[label].values.tolist()}
-
-    return read_cache(place, GATHERED, read)
 
 
 @lru_cache(MAX_OPEN_BLOCKS)

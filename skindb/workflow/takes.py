@@ -29,7 +29,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from pickle import PicklingError
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import cloudpickle
 import dask
@@ -101,8 +101,8 @@ class Outcome(Generic[Take, Result]):
 Outcomes = Generator[Outcome[Take, Result], None, None]
 
 
-class Executor(Protocol):
-    """Where the calls for takes run."""
+class ThisProcess:
+    """Calls one after the other."""
 
     def outcomes(
         self, function: Callable[[Take], Result], takes: Sequence[Take]
@@ -112,15 +112,6 @@ class Executor(Protocol):
         Where a process was killed, the takes that it and its neighbours were working on
         have a `KilledError`.
         """
-
-
-class ThisProcess:
-    """Calls one after the other."""
-
-    def outcomes(
-        self, function: Callable[[Take], Result], takes: Sequence[Take]
-    ) -> Outcomes[Take, Result]:
-        """See `Executor`."""
         for take in takes:
             yield _attempt(function, take)
 
@@ -134,10 +125,9 @@ class LocalProcesses:
     def outcomes(
         self, function: Callable[[Take], Result], takes: Sequence[Take]
     ) -> Outcomes[Take, Result]:
-        """See `Executor`."""
-        call = partial(
-            pickled_outcome, function, max(1, thread_count() // self.workers)
-        )
+        """See `ThisProcess`."""
+        threads = max(1, thread_count() // self.workers)
+        call = partial(pickled_outcome, function, threads)
         waiting = deque(takes)
         running = dict[Future[bytes], Take]()
         pool = self._pool()
@@ -477,7 +467,7 @@ class Cluster:
     def outcomes(
         self, function: Callable[[Take], Result], takes: Sequence[Take]
     ) -> Outcomes[Take, Result]:
-        """See `Executor`.
+        """See `ThisProcess`.
 
         Raises
         ------
@@ -629,7 +619,9 @@ def map_takes(
                 yield replace(outcome, attempts=2)
 
 
-def _executor(workers: int, client: Client | None, shared: Path | None) -> Executor:
+def _executor(
+    workers: int, client: Client | None, shared: Path | None
+) -> ThisProcess | LocalProcesses | Cluster:
     if client is not None:
         return Cluster(client, shared)
     return LocalProcesses(workers) if workers > 1 else ThisProcess()

@@ -198,15 +198,6 @@ def test_clean__keeps_the_scratch_of_an_ingest_for_a_day(db):
     ]
 
 
-def test_clean__ends_the_lease_of_a_killed_run(db, monkeypatch):
-    _abandon(db, monkeypatch, "model")
-    (found,) = db.garbage()
-    assert found.key == "leases/model/A1/00000001.json"
-    assert found.what.startswith("the lease of a killed run: skindb fit on")
-    assert db.clean() == [found]
-    assert db.garbage() == []
-
-
 def test_clean__drops_old_generations_that_nothing_names(db):
     """Captures 1 to 5; model 1 is from capture 2, model 2 from capture 4; a release
     names capture 3; consents stay.
