@@ -81,7 +81,6 @@ def fit_call(
         dictionary=dictionary,
         explain=False,
         wait=0.0,
-        progress=None,
     )
 
 

@@ -143,31 +143,14 @@ class Studies(click.Group):
         """Names of the studies."""
         return list(declarations())
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command:
         """The command of a study."""
-        study = declarations().get(cmd_name)
-        return None if study is None else _study_command(study)
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        """The command of the study that the first argument names."""
-        if args[0] not in declarations():
-            names = ", ".join(self.list_commands(ctx))
+        if cmd_name not in declarations():
+            names = ", ".join(declarations())
             raise click.UsageError(
-                f"Invalid value for 'STUDY': {args[0]!r} is not one of {names}.", ctx
+                f"Invalid value for 'STUDY': {cmd_name!r} is not one of {names}.", ctx
             )
-        return super().resolve_command(ctx, args)
-
-    def format_commands(
-        self,
-        ctx: click.Context,  # noqa: ARG002
-        formatter: click.HelpFormatter,
-    ) -> None:
-        """List the studies."""
-        studies = declarations().values()
-        with formatter.section("Studies"):
-            formatter.write_dl([(study.name, study.description) for study in studies])
+        return _study_command(declarations()[cmd_name])
 
 
 @click.group(
@@ -195,7 +178,8 @@ def _study_command(study: Declaration) -> click.Command:
         (TAKES, options_of(study.parameters), *STORED, SCHEDULER, common)
     ):
         run = add(run)
-    studying = click.command(study.name, help=f"Study the {study.description}.")(run)
+    text = f"Study the {study.description}."
+    studying = click.command(study.name, help=text, short_help=study.description)(run)
     if study.name == "translucency":
         studying.params += FACES
     options = [option for option in studying.params if option.name != "formula"]

@@ -31,7 +31,7 @@ EDIT_AMOUNTS = (0.0, 0.25, 1.0)
 
 
 def run_demo(
-    out: Path, *, progress: Progress | None = None, **options: Any
+    out: Path, *, progress: Progress = silent, **options: Any
 ) -> dict[str, Any]:
     """Capture virtual subjects, ingest, fit, analyse, edit, render and export them, and
     write report.html.
@@ -60,12 +60,11 @@ def run_demo(
     """
     parameters = DemoParameters(**options)
     _remove_earlier_demo(out)
-    report_progress = progress or silent
     db = Database(out / "db")
     workers = parameters.workers or min(thread_count(), MAX_WORKERS)
-    results = _make_takes(out, parameters, workers, report_progress)
+    results = _make_takes(out, parameters, workers, progress)
     # once, for every study
-    workflow.register_takes(db, workers=workers, progress=report_progress)
+    workflow.register_takes(db, workers=workers, progress=progress)
     for name, study_options in _studies(parameters).items():
         results.studies[name] = workflow.study(db, name, **study_options)
     _edit(results, db)
@@ -76,13 +75,11 @@ def run_demo(
         out / "export" / exported,
         size=MAP_TEXELS,
         merl=False,
-        progress=report_progress,
+        progress=progress,
     )
     traits = {EDIT_CONDITION: 1.0} if results.edited_take == exported else {}
-    workflow.view_takes(
-        db, [exported], out / VIEWER, traits=traits, progress=report_progress
-    )
-    report = write_report(out / "report.html", results, progress=report_progress)
+    workflow.view_takes(db, [exported], out / VIEWER, traits=traits, progress=progress)
+    report = write_report(out / "report.html", results, progress=progress)
     recovered = {
         take: recovery.summary() for take, recovery in results.recovered.items()
     }
@@ -159,7 +156,7 @@ def _make_take(
     *,
     out: Path,
     parameters: DemoParameters,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Results:
     """Simulate, ingest and fit a virtual take, and compare the model with its
     photographs and its true values.

@@ -57,7 +57,7 @@ from skindb.store import (
     subject_of,
 )
 from skindb.threads import one_blas_thread
-from skindb.types import Progress
+from skindb.types import Progress, silent
 from skindb.workflow.administration import superseded_calibrations
 from skindb.workflow.audit import logged_action
 from skindb.workflow.derive import code_digest, groups_of
@@ -114,7 +114,7 @@ def ingest_if_changed(
     visit: int | None = None,
     planned: Mapping[Path, int] | None = None,
     wait: float = 0.0,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     **parameters: Any,
 ) -> tuple[Record, bool]:
     """The record of a capture folder that is ingested, as by `ingest_take`, and True; or of
@@ -241,7 +241,7 @@ def _ingest(
     parameters: IngestParameters,
     scratch: Path,
     wait: float,
-    progress: Progress | None,
+    progress: Progress,
     is_stated: bool,
 ) -> Record:
     lease = db.lease(
@@ -262,8 +262,7 @@ def _ingest(
             db.stage("capture", capture.take, lease) as stage,
         ):
             stage.write(groups_of(tree))
-            if progress is not None:
-                progress("write", 1, 1)
+            progress("write", 1, 1)
             provenance = {str(name): value for name, value in tree.attrs.items()}
             provenance["code_digest"] = _ingest_digest()
             summary = provenance["summary"]

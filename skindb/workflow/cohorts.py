@@ -4,7 +4,7 @@ which are kept as versions of kind summary if a version lacks them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -38,11 +38,12 @@ from skindb.store import SUMMARY, CohortRequest, Database, Lookup, Record, lacki
 from skindb.types import Progress, silent
 from skindb.workflow.audit import logged
 from skindb.workflow.derive import TABLES, Derivation, code_digest, groups_of
-from skindb.workflow.takes import Result, map_takes, results_of
+from skindb.workflow.takes import map_takes, results_of
 
 if TYPE_CHECKING:
     from distributed import Client
 
+Landmarks = tuple[str, ...]  # names
 SURFACE = ("fitted", "mesh")  # groups of a model that maps and registrations need
 
 
@@ -242,7 +243,7 @@ def register_takes(
     reference: str | None = None,
     workers: int | None = None,
     client: Client | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> dict[str, Record]:
     """Register takes by their landmarks, and commit the common (u, v), regions and maps of each.
 
@@ -287,45 +288,21 @@ def register_takes(
         return current
     # small: every task gets all of them
     generations = {take: record.generation for take, record in models.items()}
-    report = progress or silent
-    outline_of = partial(_outline, db, generations)
-    map_results = partial(_map_results, workers=workers, client=client)
-    frame = _common_frame(names, reference, partial(map_results, outline_of), report)
-    call = partial(_register, derivation, generations, frame)
-    report("register", len(current), len(names))
-    pending = [take for take in names if take not in current]
-    for record in map_results(call, pending):
-        current[record.take] = record
-        report("register", len(current), len(names))
-    return {take: current[take] for take in names}
-
-
-def _map_results(
-    function: Callable[[str], Result],
-    takes: Sequence[str],
-    *,
-    workers: int | None,
-    client: Client | None,
-) -> Iterator[Result]:
-    """The results of a function for every take, see `map_takes`."""
-    return results_of(map_takes(function, takes, workers=workers, client=client))
-
-
-def _common_frame(
-    takes: Sequence[str],
-    reference: str | None,
-    outlines_of: Callable[[Sequence[str]], Iterator[tuple[str, Outline]]],
-    report: Progress,
-) -> Frame:
-    """The common (u, v) of takes, from the outlines of all."""
+    map_all = partial(map_takes, workers=workers, client=client)
     outlines: dict[str, Outline] = {}
-    report("outlines", 0, len(takes))
-    for take, shape in outlines_of(takes):
+    progress("outlines", 0, len(names))
+    for take, shape in results_of(map_all(partial(_outline, db, generations), names)):
         outlines[take] = shape
-        report("outlines", len(outlines), len(takes))
-    frame = common_frame({take: outlines[take] for take in takes}, reference=reference)
+        progress("outlines", len(outlines), len(names))
+    frame = common_frame({take: outlines[take] for take in names}, reference=reference)
     assert frame is not None
-    return frame
+    call = partial(_register, derivation, generations, frame)
+    progress("register", len(current), len(names))
+    pending = [take for take in names if take not in current]
+    for record in results_of(map_all(call, pending)):
+        current[record.take] = record
+        progress("register", len(current), len(names))
+    return {take: current[take] for take in names}
 
 
 def takes_with_landmarks(db: Database, takes: Sequence[str] | None = None) -> list[str]:

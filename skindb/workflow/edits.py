@@ -101,7 +101,7 @@ def edit_grid(
     strengths: Sequence[float] = STRENGTHS,
     study: str | None = None,
     dictionary: Path | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     **options: Any,
 ) -> dict[str, xr.DataTree]:
     """Draw a model and edits of it, one row each, with one exposure for all; nothing is
@@ -130,7 +130,6 @@ def edit_grid(
         and `trait_notes`.
     """
     source = editable_model(db, take, study, dictionary)
-    report = progress or silent
     db.require_consent(take, "export")
     options.setdefault("scale", _grid_scale(source.model))
     plain = radiance_of(source.model, **options)
@@ -138,7 +137,7 @@ def edit_grid(
     strongest = {}
     number = 0
     steps = len(rows) * len(strengths)
-    report("edits", 0, steps)
+    progress("edits", 0, steps)
     for label, amounts in rows.items():
         pictures[label] = [plain]
         for strength in strengths:
@@ -147,7 +146,7 @@ def edit_grid(
             )
             pictures[label].append(radiance_of(strongest[label], **options))
             number += 1
-            report("edits", number, steps)
+            progress("edits", number, steps)
     titles = [take, *(f"{strength:g} times the trait" for strength in strengths)]
     labels = {label: f"{label}\n{_sides(strongest[label])}" for label in rows}
     write_grid(out, {labels[label]: row for label, row in pictures.items()}, titles)

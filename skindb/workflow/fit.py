@@ -15,7 +15,7 @@ from skindb.reflectance.brdf_files import read_dictionary
 from skindb.reflectance.dictionary import EMBEDDED, Dictionary, embedded_dictionary
 from skindb.store import Database, Record, seal_of, subject_of
 from skindb.threads import one_blas_thread
-from skindb.types import Progress
+from skindb.types import Progress, silent
 from skindb.workflow.audit import logged
 from skindb.workflow.cohorts import model_with_summary, summary_parameters
 from skindb.workflow.derive import Derivation, groups_of
@@ -33,7 +33,7 @@ def fit_take(
     dictionary: Dictionary | None = None,
     generation: int | None = None,
     wait: float = 0.0,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Record:
     """Fit one take and commit its model; killed after its first pass, the same call
     continues there.
@@ -88,7 +88,7 @@ def fit_take(
                     capture, requested, dictionary=dictionary, progress=progress
                 )
                 _store_first_pass(db, scratch, take, first_tree)
-            elif progress is not None:
+            else:
                 progress("first pass of the run before", 1, 1)
             model = second_pass(
                 capture, first_tree, dictionary=dictionary, progress=progress
@@ -174,7 +174,7 @@ def fit_with(
     dictionary: Path | None = None,
     explain: bool = False,
     wait: float = 0.0,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Record | tuple[str, list[str]]:
     """Fit a take as a command asks for it, also in another process.
 

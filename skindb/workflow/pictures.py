@@ -136,7 +136,7 @@ def export_take(
     *,
     edited: bool = False,
     generation: int | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     **options: Any,
 ) -> Path:
     """Write the bundle of a model to `<out>/<take>`, or its glTF alone to `<out>/<take>.glb`.
@@ -202,7 +202,7 @@ def translucency_grid(
     *,
     site: str = "cheek",
     samples: int = 64,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> dict[str, float]:
     """Draw the takes with the shortest and the longest diffusion length at a site, with
     one light and one exposure.
@@ -241,11 +241,10 @@ def translucency_grid(
             f"{len(lengths)}",
             "name another site, or fit more takes",
         )
-    report = progress or silent
     rows = {}
     chosen = dict[str, float]()
     for i, extreme in enumerate((min, max)):
-        report("render", i, 2)
+        progress("render", i, 2)
         take = extreme(lengths, key=lengths.__getitem__)
         model = db.read("model", take)
         options: Json = {
@@ -260,7 +259,7 @@ def translucency_grid(
         title = f"{take}\n{lengths[take]:.2f} mm"
         rows[title] = [picture["radiance"].values for picture in pictures]
         chosen[take] = lengths[take]
-    report("render", 2, 2)
+    progress("render", 2, 2)
     write_grid(out, rows, ["light under the skin", "without"])
     return chosen
 
@@ -333,7 +332,7 @@ def view_takes(
     out: Path,
     *,
     environment: Path | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     **options: Any,
 ) -> Json:
     """Write a self-contained page of takes to the file `out` (.html).
@@ -370,7 +369,7 @@ def view_server(
     *,
     port: int = 0,
     environment: Path | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     **options: Any,
 ) -> PageServer:
     """A server of the page of several takes, which does not run yet; see `view_takes`.
@@ -442,13 +441,12 @@ def _faces(
     study: str | None = None,
     dictionary: Path | None = None,
     environment: Path | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Iterator[tuple[Json, str]]:
     """Record and still picture of each face, see `view_takes`."""
-    report = progress or silent
     around = None if environment is None else Environment.read(environment)
     for number, take in enumerate(takes):
-        report("view", number, len(takes))
+        progress("view", number, len(takes))
         model = db.read("model", take)
         db.require_consent(take, "export")
         require_fresh(db, "model", take)
@@ -464,7 +462,7 @@ def _faces(
             ),
             still_picture(model),
         )
-    report("view", len(takes), len(takes))
+    progress("view", len(takes), len(takes))
 
 
 def landmark_page(scan: Path, out: Path, *, port: int = 0) -> PageServer:

@@ -43,7 +43,7 @@ def quick(
     source: str | Path,
     out: str | Path,
     *,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     **parameters: Any,
 ) -> Json:
     """Maps of normals, albedo and gloss, and a page to turn and light them, from pictures
@@ -107,7 +107,7 @@ def quick(
             source,
             capture,
             {"subject": "pictures", "consent": consent},
-            progress=progress or silent,
+            progress=progress,
             **known,
         )
         (camera,) = read_json(capture / "dome/dome.json", [])["cameras"]

@@ -31,7 +31,7 @@ from skindb.hw.probe import Probe
 from skindb.hw.sequence import Override, Rehearsal, assess, slower_alternative
 from skindb.parameters import VIRTUAL_SEED, SessionParameters
 from skindb.schema.consent import SCOPES
-from skindb.types import Progress
+from skindb.types import Progress, silent
 from skindb.virtual.laboratory import Laboratory, laboratory_faults
 from skindb.workflow.simulation import simulate
 
@@ -45,7 +45,7 @@ Ask = Callable[[str, int], None]
 
 
 def plan_session(
-    out: Path, parameters: SessionParameters, *, progress: Progress | None = None
+    out: Path, parameters: SessionParameters, *, progress: Progress = silent
 ) -> tuple[Json, list[str]]:
     """Plan a session without driving any device: duration, steps and flash rate, as
     values and as lines.
@@ -91,7 +91,7 @@ def capture_session(
     parameters: SessionParameters,
     *,
     ask: Ask | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Json:
     """Capture a subject with the dome and the probe; see `skindb.hw.capture.run_capture`.
 
@@ -406,7 +406,7 @@ def _devices(
 
 @contextmanager
 def _laboratory(
-    out: Path, parameters: SessionParameters, progress: Progress | None
+    out: Path, parameters: SessionParameters, progress: Progress
 ) -> Iterator[Laboratory | None]:
     """Emulated devices around a virtual subject, or around an earlier capture that
     `--setup` names; None in a real laboratory.
@@ -437,7 +437,7 @@ def _laboratory(
         shutil.rmtree(watched, ignore_errors=True)  # the capture has its own copies
 
 
-def _virtual_subject(folder: Path, seed: int | None, progress: Progress | None) -> Path:
+def _virtual_subject(folder: Path, seed: int | None, progress: Progress) -> Path:
     """The capture of the simulated subject in a folder, simulated if it is absent."""
     seed = VIRTUAL_SEED if seed is None else seed
     subject = folder / f"subject-{seed}"

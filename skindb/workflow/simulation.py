@@ -12,7 +12,7 @@ from skindb.errors import input_error
 from skindb.files import make_private, private_file
 from skindb.format.fields import read_json
 from skindb.parameters import SimulationParameters
-from skindb.types import Progress
+from skindb.types import Progress, silent
 from skindb.virtual.capture import simulate_takes
 from skindb.virtual.person import Person, cohort_people
 from skindb.workflow.takes import map_takes, results_of
@@ -28,7 +28,7 @@ def simulate(
     conditions: Sequence[str] = (),
     visits: int = 1,
     workers: int | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     **options: Any,
 ) -> list[Path]:
     """Write virtual captures, one folder for each take, with their truth beside them.
@@ -137,7 +137,7 @@ def simulate_one(
     number: int,
     *,
     people: Sequence[Person] | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> tuple[int, Path]:
     """One of the virtual takes, by its number; see `simulate`."""
     if people is not None:

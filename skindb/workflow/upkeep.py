@@ -45,7 +45,7 @@ def refresh(
     workers: int | None = None,
     client: Client | None = None,
     wait: float = 0.0,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> list[Refreshed]:
     """Make stale models, registrations, studies and edits again, each with its own parameters.
 
@@ -82,9 +82,8 @@ def refresh(
     }
     db.complete_erasures()
     results = list[Refreshed]()
-    report = progress or silent
     for number, kind in enumerate(KINDS):
-        report("refresh", number, len(KINDS))
+        progress("refresh", number, len(KINDS))
         with computing_on(client if kind == STUDY else None, db.folder):
             results += repeat_requests(db, dictionary=dictionary, kinds=(kind,))
             # what was made before made others stale
@@ -95,7 +94,7 @@ def refresh(
             ]
             if stale:
                 results += makers[kind](stale)
-    report("refresh", len(KINDS), len(KINDS))
+    progress("refresh", len(KINDS), len(KINDS))
     return results
 
 
