@@ -32,21 +32,12 @@ COMPARISONS: dict[type[ast.cmpop], Callable[[Any, Any], Any]] = {
     ast.LtE: operator.le,
     ast.Gt: operator.gt,
     ast.GtE: operator.ge,
+    ast.In: lambda part, text: part in text,
 }
 TEXT = "text"
 NUMBER = "a number"
 TRUTH = "true or false"
 DATE = "a date"
-REFUSED = {  # the most likely expressions that are not part of the language
-    ast.Attribute: "a dot after a name",
-    ast.BinOp: "arithmetic",
-    ast.Call: "a function call",
-    ast.Constant: "a value that is not compared",
-    ast.IfExp: "if and else",
-    ast.JoinedStr: "a formatted text",
-    ast.Lambda: "a function",
-    ast.Subscript: "an index",
-}
 Column = Sequence[Any]  # a value for each row; None, NaN or NaT where it is missing
 Truth = list[bool | None]  # for each row; None where it depends on a missing value
 
@@ -73,17 +64,13 @@ def evaluate(text: str, columns: Mapping[str, Column]) -> tuple[Truth, list[str]
     InputError
         If the text is no condition, names an unknown column, or compares values of different kinds.
     """
-    tree, quoted = _parsed(text)
+    plain, tree, quoted = _parsed(text)
     # as `ast` normalises names
-    names = {unicodedata.normalize("NFKC", name): name for name in columns}
-    names |= {name: name for name in columns} | quoted
-    evaluation = _Evaluation(text, columns, names)
+    names = {unicodedata.normalize("NFKC", name): name for name in columns} | quoted
+    evaluation = _Evaluation(text, plain, columns, names)
     truth = evaluation.truth(tree, 1)
-    operands = [
-        names[node.id]
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Name) and node.id in names
-    ]
+    nodes = [node for node in ast.walk(tree) if isinstance(node, ast.Name)]
+    operands = [names[node.id] for node in nodes if node.id in names]
     if not operands:
         raise evaluation.fault("must name a column of the catalogue", "values alone")
     return truth, list(dict.fromkeys(operands))
@@ -101,6 +88,7 @@ class _Evaluation:
     """
 
     text: str
+    plain: str  # with names in place of those in backticks
     columns: Mapping[str, Column]
     names: Mapping[str, str]  # name in the tree -> column
 
@@ -115,44 +103,33 @@ class _Evaluation:
                 return _combined(rows, decisive=isinstance(op, ast.Or))
             case ast.UnaryOp(op=ast.Not(), operand=operand):
                 return _negated(self.truth(operand, depth + 1))
-            case ast.Compare(left=left, ops=[op], comparators=[ast.Name(id="missing")]):
-                if isinstance(op, ast.Is | ast.IsNot):
-                    missing: Truth = [is_missing(value) for value in self.values(left)]
-                    return _negated(missing) if isinstance(op, ast.IsNot) else missing
-            case ast.Compare(left=left, ops=[ast.In()], comparators=[right]):
-                return self.contained(left, right)
-            case ast.Compare(left=left, ops=[ast.NotIn()], comparators=[right]):
-                return _negated(self.contained(left, right))
+            case ast.Compare(left=left, ops=ops, comparators=rest):
+                pairs = zip(ops, pairwise([left, *rest]), strict=True)
+                links = [self.comparison(op, *pair) for op, pair in pairs]
+                return _combined(links, decisive=False)
             case ast.Name():
-                return self.truth_of_column(node)
-        if not isinstance(node, ast.Compare):
-            raise self.refused(node)
-        return self.comparison(node)
+                return self.comparison(ast.Eq(), node, ast.Constant(value=True))
+        raise self.refused(node)
 
-    def comparison(self, node: ast.Compare) -> Truth:
-        """Whether each row fulfils a comparison, such as ``20 < age <= 40``."""
-        if not {*map(type, node.ops)} <= COMPARISONS.keys():
-            raise self.fault(
-                "must use 'is' as in 'age is missing', and 'in' without other "
-                "comparisons beside it",
-                "another use",
-            )
-        sides = map(self.values, (node.left, *node.comparators))
-        links = [
-            self.compared(type(op), *pair)
-            for op, pair in zip(node.ops, pairwise(sides), strict=True)
-        ]
-        return _combined(links, decisive=False)
-
-    def truth_of_column(self, node: ast.Name) -> Truth:
-        """Values of a column of truth values."""
-        values = self.values(node)
-        if _kinds(values) - {TRUTH}:
-            raise self.fault(
-                "must compare a column of text or numbers",
-                f"{self.column(node.id)} alone",
-            )
-        return [None if is_missing(value) else bool(value) for value in values]
+    def comparison(self, op: ast.cmpop, left: ast.expr, right: ast.expr) -> Truth:
+        """Whether each row fulfils one comparison of a chain, such as ``20 < age <= 40``."""
+        values = self.values(left)
+        match op, right:
+            case ast.Is() | ast.IsNot(), ast.Name(id="missing"):
+                truth: Truth = [is_missing(value) for value in values]
+            case ast.In() | ast.NotIn(), ast.List(elts) | ast.Tuple(elts) | ast.Set(
+                elts
+            ) if elts:
+                links = [self.compared(ast.Eq, values, self.values(x)) for x in elts]
+                truth = _combined(links, decisive=True)
+            case ast.In() | ast.NotIn(), ast.Name() if self.is_text(right):
+                truth = self.compared(ast.In, values, self.values(right))
+            case ast.Is() | ast.IsNot() | ast.In() | ast.NotIn(), _:
+                rule = "must use 'is' as in 'age is missing', and 'in' before values or a text"
+                raise self.fault(rule, "another use")
+            case _:
+                truth = self.compared(type(op), values, self.values(right))
+        return _negated(truth) if isinstance(op, ast.IsNot | ast.NotIn) else truth
 
     def values(self, node: ast.expr) -> Column:
         """Values of a column or of a literal for each row."""
@@ -160,6 +137,10 @@ class _Evaluation:
             return self.columns[self.column(node.id)]
         rows = len(next(iter(self.columns.values())))
         return [self.literal(node)] * rows
+
+    def is_text(self, node: ast.expr) -> bool:
+        """Whether a column or a literal has only text."""
+        return _kinds(self.values(node)) <= {TEXT}
 
     def column(self, name: str) -> str:
         """The column with this name."""
@@ -209,32 +190,6 @@ class _Evaluation:
             )
         return [_compared(op, *pair) for pair in zip(left, right, strict=True)]
 
-    def contained(self, left: ast.expr, right: ast.expr) -> Truth:
-        """Whether the value of each row is in a list of literals, or its text is a part
-        of another text.
-        """
-        values = self.values(left)
-        if isinstance(right, ast.List | ast.Tuple | ast.Set):
-            if not right.elts:
-                rule = "must have at least one value after 'in'"
-                raise self.fault(rule, "an empty list")
-            links = [
-                self.compared(ast.Eq, values, [self.literal(element)] * len(values))
-                for element in right.elts
-            ]
-            return _combined(links, decisive=True)
-        texts = self.values(right)
-        if not _kinds(values) | _kinds(texts) <= {TEXT}:
-            raise self.fault(
-                "must have a list or a text after 'in', and a text before a text",
-                "other values",
-                "write, for example: condition in ['lotion', 'normal']",
-            )
-        return [
-            None if is_missing(a) or is_missing(b) else a in b
-            for a, b in zip(values, texts, strict=True)
-        ]
-
     def dates(self, values: Column) -> Column:
         """Values with dates in place of texts."""
         return [self.date(one) if isinstance(one, str) else one for one in values]
@@ -250,9 +205,9 @@ class _Evaluation:
             raise self.fault(rule, repr(text), "write it like '2026-11-01'") from None
         return moment
 
-    def refused(self, node: ast.AST) -> InputError:
+    def refused(self, node: ast.expr) -> InputError:
         """Error for a part that is not of the language."""
-        finding = REFUSED.get(type(node), "another expression")
+        finding = str(ast.get_source_segment(self.plain, node))
         return self.fault("must compare columns of the catalogue with values", finding)
 
     def fault(self, rule: str, finding: str, cure: str = EXAMPLE) -> InputError:
@@ -264,8 +219,10 @@ def _error(rule: str, finding: str, cure: str) -> InputError:
     return input_error("where", f"a condition {rule}", finding, cure)
 
 
-def _parsed(text: str) -> tuple[ast.expr, dict[str, str]]:
-    """The tree of a condition, and the column by each name that stands for one in backticks."""
+def _parsed(text: str) -> tuple[str, ast.expr, dict[str, str]]:
+    """A condition with names in place of those in backticks, its tree, and the columns of
+    these names.
+    """
     if len(text) > MAX_CHARACTERS:
         rule = f"must have at most {MAX_CHARACTERS:,} characters"
         raise _error(rule, f"{len(text):,}", "select the takes in several steps")
@@ -283,7 +240,7 @@ def _parsed(text: str) -> tuple[ast.expr, dict[str, str]]:
     try:
         with warnings.catch_warnings():  # of doubtful literals, such as 1if
             warnings.simplefilter("error")
-            return ast.parse(plain, mode="eval").body, quoted
+            return plain, ast.parse(plain, mode="eval").body, quoted
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
         reason = error.msg if isinstance(error, SyntaxError) else error
         raise _error(
