@@ -344,7 +344,6 @@ def small_database(tmp_path_factory):
         r"R_d \+- error +trusted .*\n +face +\d+( +0\.\d+ \+- 0\.\d+){3}", said
     )
     assert re.search(r"samples of +mean +p5 +p50 +p95 +max +seen\n +all ", said)
-    assert "stretch 99 %" in said
     assert chosen.strip() in said
     # a tenth of the lights is one light
     assert len(report["held_out_lights"]) == len(report["held_out_cameras"]) == 1
@@ -512,7 +511,6 @@ def test_cli__many_takes_at_a_time(tmp_path):
     named = _run("fit", db, "V001", "--eta", "1.35", "--light-gains", "on")
     assert "sigma_tr of cheek: R 0." in named.stdout
     assert "gains of the lights" in named.stdout
-    assert "V001: kept from its model: k 2\n" in named.stderr
     plain = json.loads(_run("fit", db, "V001", "--light-gains", "off", "--json").stdout)
     parameters = plain["V001"]["parameters"]
     assert (parameters["k"], parameters["eta"]) == (2, 1.35)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -205,31 +203,12 @@ def ingest(
         **asdict(parameters),
     )
     finish = partial(_ingested, database, explain=explain)
-    with _logged(database, folders):
-        results, faults = each_take(
-            call,
-            folders,
-            shared=database.folder,
-            progress=progress,
-            finish=finish,
-        )
+    results, faults = each_take(
+        call, folders, shared=database.folder, progress=progress, finish=finish
+    )
     if faults and len(captures) > 1:
         echo(f"{len(results)} of {len(captures)} captures were ingested", err=True)
     emit(results, [], faults)
-
-
-def _logged(
-    database: Database, folders: Sequence[Path]
-) -> AbstractContextManager[None]:
-    """Context of an ingest of several captures as one action; that of one capture is
-    logged when it was checked.
-    """
-    if len(folders) == 1:
-        return nullcontext()
-    subjects = skindb.workflow.captured_subjects(folders)
-    return skindb.workflow.logged_action(
-        database, "ingest", subjects=subjects, counts={"captures": len(folders)}
-    )
 
 
 def _ingested(

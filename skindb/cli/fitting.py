@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,7 +32,7 @@ from skindb.cli.shared import (
     summary_of,
 )
 from skindb.cli.terminal import bar, echo
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault
 from skindb.files import Json
 from skindb.parameters import FitParameters
 
@@ -91,7 +89,6 @@ def fit(
     )
     for take in [] if takes else workflow.takes_without_consent(database):
         echo(f"skipped: {take}: its consent does not cover fits", err=True)
-    _report_kept(database, chosen, changes)
     call = partial(
         workflow.fit_with,
         database,
@@ -120,15 +117,6 @@ def fit(
     else:
         echo(_nothing_to_fit(database, refit=refit), err=True)
     emit(results, [], faults)
-
-
-def _report_kept(database: Database, takes: Sequence[str], changes: Json) -> None:
-    """One line for each take whose fit keeps parameters that are not the defaults."""
-    for take in takes:
-        with suppress(InputError):  # the fit of the take reports it
-            kept = skindb.workflow.kept_parameters(database, take, changes)
-            if kept:
-                echo(f"{take}: kept from its model: {', '.join(kept)}", err=True)
 
 
 def _nothing_to_fit(database: Database, *, refit: bool) -> str:

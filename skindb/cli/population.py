@@ -59,7 +59,7 @@ def register(
     database = existing(db)
     workflow = skindb.workflow
     progress = bar()
-    with cluster(progress) as client:
+    with cluster() as client:
         records = workflow.register_takes(
             database,
             takes=takes or None,

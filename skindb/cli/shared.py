@@ -39,10 +39,8 @@ R = TypeVar("R")
 
 
 @contextmanager
-def cluster(progress: Progress) -> Iterator[Client | None]:
-    """Client of the scheduler that was named, whose dashboard is reported; None if none
-    was named.
-    """
+def cluster() -> Iterator[Client | None]:
+    """Client of the scheduler that was named; None if none was named."""
     scheduler = asked("scheduler")
     if scheduler is None:
         yield None
@@ -54,8 +52,6 @@ def cluster(progress: Progress) -> Iterator[Client | None]:
             # line
         )
     with skindb.workflow.connected(scheduler) as client:
-        if link := skindb.workflow.dashboard_link(client):
-            progress.dashboard(link)
         yield client
 
 
@@ -150,7 +146,7 @@ def each_take(
     following = iter([*map(str, takes[1:]), ""]) if in_turn else repeat("")
     progress.begin_takes(len(takes), take=str(takes[0]) if takes and in_turn else "")
     try:
-        with cluster(progress) as client:
+        with cluster() as client:
             for outcome in skindb.workflow.map_takes(
                 function, takes, workers=workers, client=client, shared=shared
             ):

@@ -220,7 +220,7 @@ def _run_study(
         database, "study", studied, what=study.name, arguments=arguments
     ):
         with (
-            cluster(progress) as client,
+            cluster() as client,
             skindb.workflow.computing_on(client, database.folder),
         ):
             results = skindb.workflow.study(

@@ -148,7 +148,7 @@ def refresh(
         results = workflow.stale_results(database)
     else:
         dictionary = shared_path(dictionary)
-        with cluster(progress) as client:
+        with cluster() as client:
             results = workflow.refresh(
                 database,
                 dictionary=dictionary,

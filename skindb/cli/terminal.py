@@ -132,13 +132,6 @@ class Progress:
         self.take = following
         self.stage = ""
 
-    def dashboard(self, link: str) -> None:
-        """Report the address of the dashboard of a Dask cluster."""
-        if self.style == "json":
-            echo(json.dumps({"dashboard": link}), err=True)
-        elif self.style == "bar":
-            echo(f"dashboard: {link}", err=True)
-
     def _bar(self) -> None:
         steps = self.steps
         bar = "#" * round(24 * steps.done / max(steps.total, 1))

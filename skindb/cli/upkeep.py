@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 def info(db: str, where: str | None, release: str | None) -> None:
     """List takes and their versions with paths and sizes.
 
-    With -v, samples, atlas and prediction errors are listed too.
+    With -v, samples and prediction errors are listed too.
 
     The condition of --where compares columns of db.table(): attributes of the captures
     (age, gender, ...), condition, fit_k and other parameters, status_fitted, outdated,
@@ -151,26 +151,9 @@ def _prediction_lines(database: Database, take: str) -> list[str]:
     return [*lines, *aligned([header, *sites])] if sites else lines
 
 
-def _atlas_lines(database: Database, take: str) -> list[str]:
-    capture = database.read("capture", take)
-    if "atlas" not in capture.children:  # ingested before atlases were measured
-        return []
-    atlas = capture["atlas"].to_dataset()
-    variables = skindb.schema.variables
-    columns = {
-        "atlas": "region",
-        "area log2 sd": variables.ATLAS_AREA_LOG2_SD,
-        "stretch median": variables.ATLAS_ANISOTROPY_MEDIAN,
-        "stretch 99 %": variables.ATLAS_ANISOTROPY_P99,
-        "flips": variables.ATLAS_FLIPS,
-    }
-    rows = zip(*(atlas[name].values.tolist() for name in columns.values()), strict=True)
-    return aligned([[*columns], *map(list, rows)])
-
-
 def _capture_lines(database: Database, take: str) -> list[str]:
     summary = database.record("capture", take).provenance.get("summary", {})
-    parts = (_sample_lines, _atlas_lines, calibration_lines)
+    parts = (_sample_lines, calibration_lines)
     return [
         *[line for part in parts for line in part(database, take)],
         *choice_lines(summary.get("corrections", {})),

@@ -162,15 +162,11 @@ def _stored_records(
         else:
             stored[take] = version
     if missing:
-        contents = {
-            "tables": "tables",
-            "surfels": f"a sample of {request.surfels} surfels",
-            "maps": f"maps of {request.size} texels",
-        }
         kind = records[missing[0]].kind
         raise input_error(
             few_names(missing),
-            f"a version of kind {kind} must store {contents[request.layout]} for cohorts",
+            f"a version of kind {kind} must store what the cohort of {request.layout} needs: "
+            f"surfels {request.surfels}, size {request.size}",
             "none, or different ones",
             "call skindb.workflow.summarise for them",
         )

@@ -3,7 +3,7 @@ dated, versioned, and named by the captures that used them.
 """
 
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import asdict, replace
 from datetime import datetime
@@ -220,19 +220,6 @@ def _session(db: Database, take: str) -> str | None:
     """Time of the session of the newest capture of a take."""
     session: str | None = db.record("capture", take).provenance.get("session")
     return session
-
-
-def captured_subjects(folders: Iterable[str | Path]) -> list[str]:
-    """Subjects that the files capture.json of these folders name; those of unreadable
-    ones are omitted.
-    """
-    subjects = []
-    for folder in folders:
-        record = read_json(Path(folder) / "capture.json", [])
-        subject = record.get("subject") if isinstance(record, dict) else None
-        if isinstance(subject, str):
-            subjects.append(subject)
-    return subjects
 
 
 def _ingest(

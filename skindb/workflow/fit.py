@@ -292,22 +292,6 @@ def parameters_of(
     return FitParameters(**{**_values_of_model(model, changes), **changes})
 
 
-def kept_parameters(db: Database, take: str, changes: Attributes) -> list[str]:
-    """Parameters that a fit keeps from the take's newest model and that are not the
-    defaults, as "k 6".
-    """
-    if not db.has("model", take):
-        return []
-    values = _values_of_model(db.record("model", take).provenance, changes)
-    default = FitParameters().as_dict()
-    words = {"True": "on", "False": "off"}
-    return [
-        f"{name} {words.get(str(value), value)}"
-        for name, value in values.items()
-        if name not in changes and value != default[name]
-    ]
-
-
 def _values_of_model(model: Attributes, changes: Attributes) -> dict[str, Any]:
     """Values that the parameters of a model had when it was requested; without those
     that only its surface model has, if that changes.

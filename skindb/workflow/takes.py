@@ -425,14 +425,6 @@ async def _greet(address: str) -> None:
     comm.abort()
 
 
-def dashboard_link(client: Client) -> str:
-    """Address of the page on which a cluster shows what it does; empty if it has none."""
-    try:
-        return str(client.dashboard_link or "")
-    except KeyError:  # a scheduler without that service
-        return ""
-
-
 @contextmanager
 def shared_token(folder: Path | None) -> Iterator[str]:
     """Path of a new file in the folder of a database, by which workers see that it is

@@ -40,7 +40,6 @@ LOG_THEMSELVES = {
 NOT_LOGGED = {
     "describe_calibration",
     "describe_rig",
-    "kept_parameters",
     "next_visits",
     "parameters_of",
     "plan_withdrawal",

@@ -18,7 +18,6 @@ from skindb.workflow.derive import groups_of
 from skindb.workflow.fit import (
     dictionary_at,
     fit_take,
-    kept_parameters,
     parameters_of,
     plan_take,
     takes_to_fit,
@@ -142,11 +141,6 @@ def test_takes_to_fit__a_refit_continues_with_what_is_not_done(three):
 def test_parameters_of__another_surface_drops_what_mixtures_have(three):
     ggx = FitParameters(surface="ggx", eta=1.35)
     assert parameters_of(three, "S2", {"surface": "ggx"}) == ggx
-    assert kept_parameters(three, "S2", {"surface": "ggx"}) == ["eta 1.35"]
-    assert kept_parameters(three, "S3", {}) == []
-    fit_take(three, "S3", FitParameters(k=1, rank=6, light_gains=False))
-    kept = ["k 1", "rank 6", "light_gains off"]
-    assert kept_parameters(three, "S3", {}) == kept
 
 
 def test_takes_to_fit__a_changed_kernel_or_capture_is_a_reason_to_refit(
