@@ -5,8 +5,8 @@ from typing import Any
 
 import dask
 import numpy as np
-import xarray as xr
 from dask.system import cpu_count
+from xarray import Dataset, apply_ufunc
 
 from skindb.schema import VARIABLES, label
 
@@ -15,14 +15,14 @@ Kernel = Callable[..., tuple[np.ndarray[Any, Any], ...]]
 
 def elementwise(
     kernel: Kernel,
-    ds: xr.Dataset,
+    ds: Dataset,
     *,
     over: str,
     inputs: Sequence[str],
     outputs: Sequence[str],
     sizes: Mapping[str, int] | None = None,
     **params: Any,
-) -> xr.Dataset:
+) -> Dataset:
     """Run `kernel` on blocks along the dim `over`; lazy where the inputs are lazy.
 
     Parameters
@@ -63,7 +63,7 @@ def elementwise(
 
     # one call of the kernel per block gives all outputs; inputs without `over` are
     # shared by every block
-    results = xr.apply_ufunc(
+    results = apply_ufunc(
         declared,
         *arrays,
         input_core_dims=[
@@ -82,7 +82,7 @@ def elementwise(
     coords = {
         dim: ds.coords[dim] for spec in specs for dim in spec.dims if dim in ds.coords
     }
-    return xr.Dataset(
+    return Dataset(
         {name: label(name, r.data) for name, r in zip(outputs, results, strict=True)},
         coords,
     )

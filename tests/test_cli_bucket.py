@@ -62,8 +62,8 @@ def test_cli__all_steps_work_in_a_bucket(new_database, tmp_path, monkeypatch):
     _done("withdraw", url, "V001", "--yes")
     assert skindb.open(url).subjects() == []
     _done("clean", url, "--yes")
-    intact, *requested = _done("verify", url).splitlines()
-    assert intact == "Every version is intact."
+    assert _done("verify", url) == "Every version is intact.\n"
+    requested = _done("refresh", url, "--dry-run").splitlines()
     # no takes are left to compute them from
     assert all(line.endswith("a subject was withdrawn") for line in requested)
 

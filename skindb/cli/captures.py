@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import skindb
+from skindb import workflow
 from skindb.cli.options import (
     DB,
     PATH,
@@ -114,12 +115,10 @@ def simulate(
     people = (
         None
         if cohort is None
-        else skindb.workflow.begin_cohort(
-            out, cohort, conditions, parameters, visits=visits
-        )
+        else workflow.begin_cohort(out, cohort, conditions, parameters, visits=visits)
     )
     call = partial(
-        skindb.workflow.simulate_one, out, parameters, people=people, progress=progress
+        workflow.simulate_one, out, parameters, people=people, progress=progress
     )
     numbers = range(takes if people is None else len(people))
     results, faults = each_take(call, numbers, progress=progress, finish=_simulated)
@@ -192,10 +191,10 @@ def ingest(
     database = skindb.open(db)
     folders = [shared_path(folder) for folder in captures]
     call = partial(
-        skindb.workflow.ingest_if_changed,
+        workflow.ingest_if_changed,
         database,
         visit=visit,
-        planned={} if visit else skindb.workflow.next_visits(database, folders),
+        planned={} if visit else workflow.next_visits(database, folders),
         again=again,
         crop=crop,
         wait=wait,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import skindb
+from skindb import workflow
 from skindb.cli.options import (
     DB,
     DICTIONARY,
@@ -80,7 +81,6 @@ def fit(
     """
     database = existing(db)
     progress = bar()
-    workflow = skindb.workflow
     dictionary = shared_path(dictionary)
     # its faults are reported once, before the fits start
     workflow.dictionary_at(dictionary)

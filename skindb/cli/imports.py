@@ -10,6 +10,7 @@ from pathlib import Path
 import click
 
 import skindb
+from skindb import workflow
 from skindb.cli.options import PATH, command, options_of
 from skindb.cli.shared import emit
 from skindb.cli.terminal import bar, echo
@@ -96,7 +97,7 @@ def quick(source: Path, out: Path, parameters: QuickParameters) -> None:
     """
     # the folder with copies of the pictures is removed at the end
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    result = skindb.workflow.quick(source, out, progress=bar(), **asdict(parameters))
+    result = workflow.quick(source, out, progress=bar(), **asdict(parameters))
     for note in result["notes"]:
         echo(f"note: {note}", err=True)
     total = sum(result["points"].values())

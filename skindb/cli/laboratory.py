@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 import skindb
+from skindb import workflow
 from skindb.cli.options import DB, PATH, PORT, command, options_of
 from skindb.cli.shared import emit, existing, serve, writable
 from skindb.cli.terminal import bar, wait_for_enter
@@ -48,10 +49,10 @@ def capture(
     """
     ask = None if parameters.virtual or yes else _ask
     if only_plan:
-        plan, lines = skindb.workflow.plan_session(out, parameters, progress=bar())
+        plan, lines = workflow.plan_session(out, parameters, progress=bar())
         emit(plan, lines)
         return
-    report = skindb.workflow.capture_session(out, parameters, ask=ask, progress=bar())
+    report = workflow.capture_session(out, parameters, ask=ask, progress=bar())
     count = report["flashes_per_second"]
     rate = f"at most {count} {'flash' if count == 1 else 'flashes'} in any second"
     before = (
@@ -107,7 +108,6 @@ def calibrate(
     2, key `calibration`) use its newest version when they are ingested. Earlier
     versions are kept.
     """
-    workflow = skindb.workflow
     if from_takes:
         database = existing(db)
         default = CalibrationParameters(parameters.name)
@@ -239,4 +239,4 @@ def landmarks(scan: Path, out: Path, port: int) -> None:
     which skindb ingest crops the scan.
     """
     writable(out, ".json")
-    serve(skindb.workflow.landmark_page(scan, out, port=port), out=str(out))
+    serve(workflow.landmark_page(scan, out, port=port), out=str(out))

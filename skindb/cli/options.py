@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 import click
 from click.core import ParameterSource
 
-import skindb
+from skindb import workflow
 from skindb.files import Json
 from skindb.limits import MAX_WAIT_S, MAX_WORKERS
 from skindb.parameters import DICTIONARY_HELP, Option, broken_rule, option_of, words_of
@@ -21,6 +21,21 @@ from skindb.parameters import DICTIONARY_HELP, Option, broken_rule, option_of, w
 DB = click.argument("db", metavar="DB")
 PATH = click.Path(path_type=Path)
 TAKE = click.argument("take")
+TAKES = click.option(
+    "--take",
+    "takes",
+    multiple=True,
+    help="Take to use (may be given several times).  [default: all]",
+)
+WHERE = click.option(
+    "--where",
+    help="Condition that takes must fulfil, for example: condition == 'lotion' and age > 40.",
+)
+RELEASE = click.option(
+    "--release",
+    metavar="NAME",
+    help="Release whose versions are used.  [default: the newest versions]",
+)
 DICTIONARY = click.option("--dictionary", type=PATH, help=DICTIONARY_HELP)
 PORT = click.option(
     "--port",
@@ -234,7 +249,7 @@ PROGRESS = click.option(
 
 def _act_as(ctx: click.Context, _: click.Parameter, actor: str | None) -> None:
     if actor is not None:
-        ctx.with_resource(skindb.workflow.acting_as(actor))
+        ctx.with_resource(workflow.acting_as(actor))
 
 
 ACTOR = click.option(

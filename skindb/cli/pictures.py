@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 import skindb
+from skindb import workflow
 from skindb.cli.options import (
     DB,
     GENERATION,
@@ -82,14 +83,14 @@ def render(
         require_one_take(out, chosen)
     request["edited"] = edited
     call = partial(
-        skindb.workflow.render_take,
+        workflow.render_take,
         database,
         shared_path(out),
         **request,
         **vars(parameters),
     )
     finish = partial(_rendered, explain=request["explain"], error=parameters.error)
-    with skindb.workflow.logged_action(database, "render", chosen, arguments=request):
+    with workflow.logged_action(database, "render", chosen, arguments=request):
         results, faults = each_take(
             call,
             chosen,
@@ -140,7 +141,7 @@ def compare(
 
     The measures are RMSE, PSNR, SSIM and CIEDE2000 for each photograph that ingest kept.
     """
-    comparisons = skindb.workflow.compare_take(
+    comparisons = workflow.compare_take(
         existing(db), take, generation=generation, **vars(parameters)
     )
     if out:
@@ -185,7 +186,7 @@ def show(db: str, take: str, variable: str, out: Path, at: tuple[str, ...]) -> N
     A variable is, for example, sample_count or fit_status. OUT is a picture (.png, .pdf, .svg).
     """
     writable(out, ".png", ".pdf", ".svg")
-    report = skindb.workflow.show_take(
+    report = workflow.show_take(
         existing(db), take, variable, out, at=dict(map(_label, at))
     )
     emit(report, [report["path"]])
@@ -234,13 +235,13 @@ def export(
         )
     options = {"edited": edited, "generation": generation, **vars(parameters)}
     call = partial(
-        skindb.workflow.export_take,
+        workflow.export_take,
         database,
         shared_path(out),
         progress=progress,
         **options,
     )
-    with skindb.workflow.logged_action(database, "export", chosen, arguments=options):
+    with workflow.logged_action(database, "export", chosen, arguments=options):
         results, faults = each_take(
             call,
             chosen,
@@ -303,9 +304,9 @@ def view(
     database = existing(db)
     chosen = chosen_takes(database, takes, "model")
     if explain:
-        with skindb.workflow.logged_action(database, "view", chosen, explain=True):
+        with workflow.logged_action(database, "view", chosen, explain=True):
             skipped = {
-                take: skindb.workflow.explain_view(database, take, traits=amounts)
+                take: workflow.explain_view(database, take, traits=amounts)
                 for take in chosen
             }
         lines = [f"{take}: {line}" for take, lines in skipped.items() for line in lines]
@@ -313,9 +314,9 @@ def view(
         return
     options = {**vars(parameters), "traits": amounts, "progress": bar()}
     if out is None:
-        server = skindb.workflow.view_server(database, chosen, port=port, **options)
+        server = workflow.view_server(database, chosen, port=port, **options)
         serve(server, takes=chosen)
         return
     writable(out, ".html")
-    report = skindb.workflow.view_takes(database, chosen, out, **options)
+    report = workflow.view_takes(database, chosen, out, **options)
     emit(report, [report["path"]])

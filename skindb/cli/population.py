@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import skindb
+from skindb import workflow
 from skindb.cli.options import (
     DB,
     PATH,
     SCHEDULER,
     TAKE,
+    TAKES,
     WORKERS,
     asked,
     command,
@@ -24,7 +26,7 @@ from skindb.errors import few_names
 from skindb.parameters import EditParameters
 
 if TYPE_CHECKING:
-    import xarray as xr
+    from xarray import DataTree
 
     from skindb.store import Record
 
@@ -34,12 +36,7 @@ EXTRAPOLATED = "the edit is outside the data, and its result is not reliable"
 
 @command
 @DB
-@click.option(
-    "--take",
-    "takes",
-    multiple=True,
-    help="Take to register (may be given several times).  [default: all]",
-)
+@TAKES
 @click.option(
     "--reference",
     metavar="TAKE",
@@ -57,7 +54,6 @@ def register(
     The report says how well the landmarks agree.
     """
     database = existing(db)
-    workflow = skindb.workflow
     progress = bar()
     with cluster() as client:
         records = workflow.register_takes(
@@ -124,16 +120,16 @@ def edit(db: str, take: str, grid: Path | None, parameters: EditParameters) -> N
                 parameters.traits, amounts.items(), strict=True
             )
         }
-        drawn = skindb.workflow.edit_grid(
+        drawn = workflow.edit_grid(
             database, take, rows, grid, progress=bar(), **options
         )
         _report_grid(grid, drawn)
     else:
-        tree = skindb.workflow.edit(database, take, amounts, **options)
+        tree = workflow.edit(database, take, amounts, **options)
         _report_edit(database.record("edit", take, tree.attrs["generation"]), tree)
 
 
-def _report_grid(grid: Path, drawn: dict[str, xr.DataTree]) -> None:
+def _report_grid(grid: Path, drawn: dict[str, DataTree]) -> None:
     """Print the reports of the edits of a picture."""
     reports = {
         label: {"edit_report": tree.attrs["edit_report"]}
@@ -147,7 +143,7 @@ def _report_grid(grid: Path, drawn: dict[str, xr.DataTree]) -> None:
     emit({"path": str(grid), "edits": reports}, [str(grid), *notes])
 
 
-def _distance(tree: xr.DataTree) -> str:
+def _distance(tree: DataTree) -> str:
     """How far an edit is from the data, with a warning if that is far."""
     distance = float(tree.attrs["edit_distance"])
     warning = f"; {EXTRAPOLATED}" if distance > MAX_EDIT_DISTANCE else ""
@@ -157,7 +153,7 @@ def _distance(tree: xr.DataTree) -> str:
     )
 
 
-def _report_edit(record: Record, tree: xr.DataTree) -> None:
+def _report_edit(record: Record, tree: DataTree) -> None:
     """Print the report of an edit that was stored."""
     takes = tree.attrs["study_takes"]
     lines = [
@@ -173,7 +169,7 @@ def _report_edit(record: Record, tree: xr.DataTree) -> None:
     emit(summary, [*lines, *(f"  {line}" for line in _edit_notes(tree))])
 
 
-def _edit_notes(tree: xr.DataTree) -> list[str]:
+def _edit_notes(tree: DataTree) -> list[str]:
     """Notes of an edit on its traits and its changes, one line each."""
     return [
         *tree.attrs["trait_notes"],

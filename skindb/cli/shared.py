@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import click
 
 import skindb
+from skindb import workflow
 from skindb.cli.options import asked
 from skindb.cli.terminal import Progress, echo
 from skindb.errors import Fault, InputError, few_names, input_error, require
@@ -51,7 +52,7 @@ def cluster() -> Iterator[Client | None]:
             # messages of distributed; their consequence for the takes is reported in one
             # line
         )
-    with skindb.workflow.connected(scheduler) as client:
+    with workflow.connected(scheduler) as client:
         yield client
 
 
@@ -147,7 +148,7 @@ def each_take(
     progress.begin_takes(len(takes), take=str(takes[0]) if takes and in_turn else "")
     try:
         with cluster() as client:
-            for outcome in skindb.workflow.map_takes(
+            for outcome in workflow.map_takes(
                 function, takes, workers=workers, client=client, shared=shared
             ):
                 name, result = _finished(outcome, finish)
@@ -178,7 +179,7 @@ def _finished(
         return name, result
     if outcome.traceback and asked("verbose"):
         echo(*outcome.traceback.splitlines(), err=True)
-    faults = dict.fromkeys(skindb.workflow.faults_of(outcome))
+    faults = dict.fromkeys(workflow.faults_of(outcome))
     return name, [_placed(fault, name) for fault in faults]
 
 

@@ -20,31 +20,31 @@ import click
 
 import skindb
 from skindb import parameters as parameter_module
-from skindb.cli.options import DB, PATH, SCHEDULER, command, common, options_of
+from skindb import workflow
+from skindb.cli.options import (
+    DB,
+    PATH,
+    RELEASE,
+    SCHEDULER,
+    TAKES,
+    command,
+    common,
+    options_of,
+)
 from skindb.cli.shared import aligned, cluster, emit, existing, shared_path, writable
 from skindb.cli.terminal import bar
 from skindb.errors import input_error
 from skindb.files import csv_text, private_file
 
 if TYPE_CHECKING:
-    import xarray as xr
+    from xarray import DataTree
 
     from skindb.store import Database
 
 ANALYSIS = Path(skindb.__file__).parent / "analysis"
-TAKES = click.option(
-    "--take",
-    "takes",
-    multiple=True,
-    help="Take to use (may be given several times).  [default: all]",
-)
 # of every study, after its own parameters
 STORED = (
-    click.option(
-        "--release",
-        metavar="NAME",
-        help="Release whose versions are used.  [default: the newest versions]",
-    ),
+    RELEASE,
     click.option(
         "--name",
         help="Name under which the study is stored.  [default: its parameters]",
@@ -216,19 +216,19 @@ def _run_study(
     progress(f"analyze {study.name}", 0, 1)
     studied = takes or database.takes("model", release=release)
     arguments = {"faces": faces is not None}
-    with skindb.workflow.logged_action(
+    with workflow.logged_action(
         database, "study", studied, what=study.name, arguments=arguments
     ):
         with (
             cluster() as client,
-            skindb.workflow.computing_on(client, database.folder),
+            workflow.computing_on(client, database.folder),
         ):
-            results = skindb.workflow.study(
+            results = workflow.study(
                 database, study.name, takes=takes, release=release, name=name, **chosen
             )
         progress(f"analyze {study.name}", 1, 1)
         if faces:
-            skindb.workflow.translucency_grid(
+            workflow.translucency_grid(
                 database, faces, site=site or "cheek", progress=progress
             )
         if plot:
@@ -237,7 +237,7 @@ def _run_study(
 
 
 def _report(
-    database: Database, study: Declaration, results: xr.DataTree, csv: Path | None
+    database: Database, study: Declaration, results: DataTree, csv: Path | None
 ) -> None:
     """Print the table and the notes of a study, and write its table."""
     header, rows = skindb.analysis.tabulate_study(results)
@@ -291,7 +291,7 @@ def _unit_lines(units: dict[str, str], columns: list[str]) -> list[str]:
 @command
 @DB
 @TAKES
-@click.option("--release", help="Name of a release.  [default: the newest versions]")
+@RELEASE
 @click.option(
     "--out", type=PATH, required=True, help="Table to write (.csv or .parquet)."
 )
@@ -302,9 +302,7 @@ def tidy(db: str, takes: tuple[str, ...], release: str | None, out: Path) -> Non
     condition, visit and repeat, and the attributes of the captures.
     """
     writable(out, ".csv", ".parquet")
-    table, skipped = skindb.workflow.tidy_table(
-        existing(db), takes=takes, release=release
-    )
+    table, skipped = workflow.tidy_table(existing(db), takes=takes, release=release)
     if out.suffix == ".csv":
         text = csv_text([*table], table.values.tolist())
         private_file(out).write_text(text, encoding="utf-8")

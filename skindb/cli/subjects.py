@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING
 
 import click
 
-import skindb
+from skindb import workflow
 from skindb.cli.options import (
     DB,
     DICTIONARY,
     PATH,
     SCHEDULER,
+    TAKES,
     WAIT,
+    WHERE,
     WORKERS,
     asked,
     command,
@@ -59,7 +61,7 @@ def consent(db: str, subject: str, scope: str | None) -> None:
                 "for example fit,statistics",
             )
         names = [] if names == ["none"] else names
-        skindb.workflow.record_consent(database, subject, names)
+        workflow.record_consent(database, subject, names)
     history = database.consent_history(subject)
     emit(
         history,
@@ -73,16 +75,8 @@ def consent(db: str, subject: str, scope: str | None) -> None:
 @command
 @DB
 @click.argument("name", required=False)
-@click.option(
-    "--take",
-    "takes",
-    multiple=True,
-    help="Take of the release (may be given several times).  [default: all]",
-)
-@click.option(
-    "--where",
-    help="Condition that takes must fulfil, for example: condition == 'normal' and age > 40.",
-)
+@TAKES
+@WHERE
 def release(
     db: str, name: str | None, takes: tuple[str, ...], where: str | None
 ) -> None:
@@ -98,7 +92,7 @@ def release(
         if where is not None:
             fulfilling = set(database.takes("model", where=where))
             chosen = [take for take in chosen if take in fulfilling]
-        skindb.workflow.create_release(database, name, chosen)
+        workflow.create_release(database, name, chosen)
     listed = {
         listed_name: _released(database, listed_name)
         for listed_name in ([name] if name else database.takes("release"))
@@ -142,7 +136,6 @@ def refresh(
     to statistics. Each result is computed again with its own parameters.
     """
     database = existing(db)
-    workflow = skindb.workflow
     progress = bar()
     if dry_run:
         results = workflow.stale_results(database)
@@ -233,7 +226,6 @@ def withdraw(
     given, are not reached.
     """
     database = existing(db)
-    workflow = skindb.workflow
     plan = workflow.plan_withdrawal(database, subject, backups=backups)
     if report is not None:
         require_folder(report)

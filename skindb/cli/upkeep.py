@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import skindb
-from skindb.cli.options import DB, PATH, asked, command
+from skindb import workflow
+from skindb.cli.options import DB, PATH, RELEASE, WHERE, asked, command
 from skindb.cli.shared import (
     aligned,
     calibrated_by_lines,
@@ -20,7 +21,6 @@ from skindb.cli.shared import (
     emit,
     existing,
 )
-from skindb.cli.subjects import stale_as_json
 from skindb.errors import InputError, input_error
 from skindb.files import Json
 
@@ -30,13 +30,8 @@ if TYPE_CHECKING:
 
 @command
 @DB
-@click.option(
-    "--where",
-    help="Condition that takes must fulfil, for example: condition == 'lotion' and age > 40.",
-)
-@click.option(
-    "--release", metavar="NAME", help="Release whose takes and versions are listed."
-)
+@WHERE
+@RELEASE
 def info(db: str, where: str | None, release: str | None) -> None:
     """List takes and their versions with paths and sizes.
 
@@ -60,7 +55,7 @@ def info(db: str, where: str | None, release: str | None) -> None:
     details = asked("verbose")
     # figures of merit and translucency are values of subjects
     log = (
-        skindb.workflow.logged_action(database, "show", result["takes"])
+        workflow.logged_action(database, "show", result["takes"])
         if details
         else nullcontext()
     )
@@ -69,10 +64,10 @@ def info(db: str, where: str | None, release: str | None) -> None:
     if (
         where is None
         and release is None
-        and (superseded := skindb.workflow.superseded_calibrations(database))
+        and (superseded := workflow.superseded_calibrations(database))
     ):
         result["superseded_calibrations"] = superseded
-        lines += skindb.workflow.superseded_lines(superseded)
+        lines += workflow.superseded_lines(superseded)
     emit(result, lines or ["The database holds no takes."])
 
 
@@ -169,20 +164,11 @@ DETAILS = {"capture": _capture_lines, "model": _prediction_lines}
 def verify(db: str) -> None:
     """Read every file of every version and report all damage.
 
-    Results that are out of date and garbage, to which no record refers, are listed too;
-    they are not damage.
+    Results that are out of date are no damage, see skindb refresh --dry-run, and neither is
+    garbage, see skindb clean.
     """
-    database = existing(db)
-    faults = database.verify()
-    garbage = database.garbage()
-    stale = skindb.workflow.stale_results(database)
-    lines = [f"out of date: {item.name}: {item.reasons[0]}" for item in stale]
-    lines += [f"garbage, see skindb clean: {_garbage_line(item)}" for item in garbage]
-    report = {
-        "stale": [stale_as_json(item) for item in stale],
-        "garbage": [asdict(item) for item in garbage],
-    }
-    emit(report, [*([] if faults else ["Every version is intact."]), *lines], faults)
+    faults = existing(db).verify()
+    emit({}, [] if faults else ["Every version is intact."], faults)
 
 
 @command
@@ -242,7 +228,7 @@ def clean(db: str, generations: int | None, yes: bool) -> None:
     """
     database = existing(db)
     if yes:
-        garbage = skindb.workflow.clean(database, generations=generations)
+        garbage = workflow.clean(database, generations=generations)
     else:
         garbage = database.garbage(generations=generations)
     going = [item for item in garbage if not item.kept]
@@ -282,7 +268,7 @@ def backup(db: str, destination: str, verify: bool) -> None:
     meanwhile. An interrupted backup is continued by the same command. Subjects who were
     withdrawn are removed from all earlier states.
     """
-    report = skindb.workflow.backup(existing(db), destination, verify=verify)
+    report = workflow.backup(existing(db), destination, verify=verify)
     lines = [
         f"state {report.number}: {report.versions} versions",
         f"files: {report.copied} copied ({report.bytes / 1e6:.1f} MB), {report.present} present, "
@@ -335,18 +321,14 @@ def restore(
     other command refuses DB.
     """
     if only_list:
-        states = skindb.workflow.backup_states(source)
-        rows = [
-            [f"state {state.number}", state.created, f"{state.versions} versions"]
-            for state in states
-        ]
+        names = ("number", "created", "versions")
         listed = [
-            {
-                "number": state.number,
-                "created": state.created,
-                "versions": state.versions,
-            }
-            for state in states
+            {name: getattr(state, name) for name in names}
+            for state in workflow.backup_states(source)
+        ]
+        rows = [
+            [f"state {n}", when, f"{count} versions"]
+            for n, when, count in map(dict.values, listed)
         ]
         emit(listed, aligned(rows) if rows else ["no states"])
         return
@@ -354,7 +336,7 @@ def restore(
         raise click.UsageError("Missing argument 'DB'.")
     if markers is not None and without_markers:
         raise click.UsageError("--markers and --without-markers exclude each other")
-    restored = skindb.workflow.restore(
+    restored = workflow.restore(
         source, db, number=number, markers=markers, without_markers=without_markers
     )
     emit(

@@ -37,7 +37,6 @@ from skindb.store.place import (
     TAKE,
     TIME_HEX,
     Place,
-    UnavailableError,
     in_parallel,
 )
 from skindb.store.record import (
@@ -45,7 +44,6 @@ from skindb.store.record import (
     Record,
     collect_faults,
     damage_as_fault,
-    reason_of,
     record_from_json,
     require_format,
     seal_of,
@@ -224,24 +222,13 @@ class Archive:
             if (match := CONTENT.fullmatch(name))
         }
 
-    def read(self, item: Item) -> bytes:
-        """The content of a file of the database, compared with its digest."""
-        name, digest, size = item
-        key = content_key(digest)
-        place = self.place
-        try:
-            content = (
-                place.read_small(key) if size is None else place.read(key, 0, size)
-            )
-            if hashlib.sha256(content).hexdigest() == digest:
-                return content
-            finding = "different content"
-        except UnavailableError:
-            raise
-        except (OSError, InputError) as error:
-            finding = reason_of(error)
-        location = place.where(key)
-        raise input_error(location, AS_WRITTEN, f"{finding} for {name}", CURE_CONTENT)
+    def parsed(self, parse: Callable[[bytes], R], item: Item) -> R:
+        """What a function makes of the content of a file of the database, which is
+        compared with its digest.
+        """
+        key = content_key(item[1])
+        with damage_as_fault(self.place.where(key), AS_WRITTEN, CURE_CONTENT):
+            return parse(read_item(self.place, key, item))
 
     def put(self, content: bytes, digest: str, guard: Callable[[], None]) -> None:
         """Write a content under its digest, unless the guard raises."""
@@ -284,12 +271,13 @@ class Archive:
             for key, digest in state.files.items()
             if key.startswith(f"{REQUESTS}/")
         ]
-        return [request for _, request in intact(self._request, items, faults)]
+        read = intact(partial(self.parsed, request_from_json), items, faults)
+        return [request for _, request in read]
 
     def version_items(self, record: Record) -> list[Item]:
         """All files of a version except for its record; `InputError` if its manifest is damaged."""
         beside = (record.beside("manifest"), record.manifest, None)
-        return items_of(record, self._parsed(beside, manifest_from_json))
+        return items_of(record, self.parsed(manifest_from_json, beside))
 
     def uses(self, state: State, seen: set[str], faults: list[Fault]) -> list[Item]:
         """Every content that a state needs.
@@ -333,16 +321,7 @@ class Archive:
         return len(unused)
 
     def _record(self, item: Item) -> Record:
-        return self._parsed(item, lambda content: record_from_json(content, item[0]))
-
-    def _request(self, item: Item) -> Request:
-        return self._parsed(item, request_from_json)
-
-    def _parsed(self, item: Item, parse: Callable[[bytes], R]) -> R:
-        content = self.read(item)
-        location = f"{self.place.where(content_key(item[1]))}, {item[0]}"
-        with damage_as_fault(location, AS_WRITTEN, CURE_CONTENT):
-            return parse(content)
+        return self.parsed(lambda content: record_from_json(content, item[0]), item)
 
 
 def backup_states(url: str) -> list[State]:
@@ -370,6 +349,15 @@ def require_apart(backup: Place, database: Place) -> None:
             f"the database {database.name}",
             "give another folder",
         )
+
+
+def read_item(place: Place, key: str, item: Item) -> bytes:
+    """The content of a file; `ValueError` if it does not have the digest that is known."""
+    name, digest, size = item
+    content = place.read_small(key) if size is None else place.read(key, 0, size)
+    if digest not in ("", hashlib.sha256(content).hexdigest()):
+        raise ValueError(f"different content for {name}")
+    return content
 
 
 def content_key(digest: str) -> str:

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from numcodecs import blosc
+from xarray import Dataset, DataTree, open_dataset, open_datatree
 from xarray.backends import BackendArray
 from xarray.core import indexing
 from zarr.codecs import BloscCodec, BytesCodec
@@ -97,7 +97,7 @@ class ShardedArray(BackendArray):
 
 def open_version(
     place: Place, record: Record, groups: Sequence[str] | None = None
-) -> xr.DataTree:
+) -> DataTree:
     """A version, or some groups of it, as a lazy DataTree, in blocks of 4,096 surfels
     where it has samples, and of whole objects elsewhere.
     """
@@ -107,25 +107,25 @@ def open_version(
     else:
         store = VerifiedStore(place, record)
         # chunks={} would use the inner chunks, which gives sixteen times as many tasks
-        tree = xr.open_datatree(store, engine="zarr", consolidated=True, chunks=None)  # type: ignore[arg-type]
+        tree = open_datatree(store, engine="zarr", consolidated=True, chunks=None)  # type: ignore[arg-type]
         lazy = {
             path: _lazy(store, path.strip("/"), node.to_dataset(inherit=False))
             for path, node in tree.subtree_with_keys
         }
         attrs = tree.attrs
-    version = xr.DataTree.from_dict(lazy)
+    version = DataTree.from_dict(lazy)
     version.attrs = {**attrs, "generation": record.generation}
     return version
 
 
-def open_group(place: Place, record: Record, group: str) -> xr.Dataset:
+def open_group(place: Place, record: Record, group: str) -> Dataset:
     """One group of a version, without opening the others."""
     store: Any = VerifiedStore(place, record)
     options: dict[str, Any] = {"engine": "zarr", "consolidated": True, "chunks": None}
-    return _lazy(store, group, xr.open_dataset(store, group=group, **options))
+    return _lazy(store, group, open_dataset(store, group=group, **options))
 
 
-def _lazy(store: VerifiedStore, group: str, ds: xr.Dataset) -> xr.Dataset:
+def _lazy(store: VerifiedStore, group: str, ds: Dataset) -> Dataset:
     """A group that xarray has opened, in blocks of surfels; arrays with the codecs of
     skindb are decoded straight into the result.
     """

@@ -28,6 +28,7 @@ from skindb.store.archive import (
     intact,
     items_of,
     other_files,
+    read_item,
     require_apart,
     seal_of_withdrawals,
     surviving,
@@ -47,7 +48,7 @@ from skindb.store.markers import (
 from skindb.store.place import KINDS_OF_ONE_SUBJECT, RELEASE, Place
 from skindb.store.record import Record, damage_as_fault
 from skindb.store.stale import REQUESTS, read_requests
-from skindb.store.verified import AS_COMMITTED, CHANGED, CURE, read_manifest
+from skindb.store.verified import AS_COMMITTED, CURE, read_manifest
 
 T = TypeVar("T")
 MAX_LISTS = 100
@@ -138,7 +139,7 @@ def verify_archive(archive: Archive) -> list[Fault]:
             if item[1] not in checked
         }
         checked |= fresh.keys()
-        intact(lambda item: bool(archive.read(item)), fresh.values(), faults)
+        intact(partial(archive.parsed, bool), fresh.values(), faults)
     return list(dict.fromkeys(faults))
 
 
@@ -375,15 +376,11 @@ def _digest(place: Place, key: str) -> str:
 
 def _copy(place: Place, archive: Archive, guard: Callable[[], None], item: Item) -> int:
     """Copy a file of the database that is as it was committed; returns its size."""
-    name, digest, _ = item
     content = _read(place, item)
-    if hashlib.sha256(content).hexdigest() != digest:
-        raise input_error(place.where(name), AS_COMMITTED, CHANGED, CURE)
-    archive.put(content, digest, guard)
+    archive.put(content, item[1], guard)
     return len(content)
 
 
 def _read(place: Place, item: Item) -> bytes:
-    name, _, size = item
-    with damage_as_fault(place.where(name), AS_COMMITTED, CURE):
-        return place.read_small(name) if size is None else place.read(name, 0, size)
+    with damage_as_fault(place.where(item[0]), AS_COMMITTED, CURE):
+        return read_item(place, item[0], item)

@@ -9,7 +9,7 @@ from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
-import xarray as xr
+from xarray import Dataset
 
 from skindb.errors import Fault, InputError, few_names, input_error, require
 from skindb.schema.cohort import (
@@ -109,7 +109,7 @@ def cohort(
     kind: str,
     takes: Sequence[str] | None,
     dim: str,
-) -> xr.Dataset:
+) -> Dataset:
     """See `Database.cohort`."""
     layout = request.layout
     if layout not in GROUP:
@@ -436,6 +436,6 @@ def _without_samples(parts: Sequence[Part]) -> list[Part]:
 
 
 @lru_cache(MAX_OPEN_GROUPS)
-def _group(address: Address, name: str) -> xr.Dataset:
+def _group(address: Address, name: str) -> Dataset:
     record = address.record()
     return require_recorded(record, name, open_group(address.place, record, name))

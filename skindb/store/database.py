@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import xarray as xr
+from xarray import Dataset, DataTree
 
 from skindb.errors import Fault, InputError, input_error, require
 from skindb.files import Json, make_private
@@ -220,7 +220,7 @@ class Database:
         generation: int | None = None,
         release: str | None = None,
         groups: Sequence[str] | None = None,
-    ) -> xr.DataTree:
+    ) -> DataTree:
         """A version as a lazy DataTree, in blocks of 4,096 surfels.
 
         Every file is verified against its committed digest before it is used.
@@ -312,7 +312,7 @@ class Database:
         """
         return consent_history(self.place, subject)
 
-    def tables(self, record: Record) -> xr.Dataset:
+    def tables(self, record: Record) -> Dataset:
         """The tables kept beside a version; empty if it has none."""
         return read_tables(self.place, record)
 
@@ -327,7 +327,7 @@ class Database:
         surfels: int = 2000,
         size: int = 512,
         release: str | None = None,
-    ) -> xr.Dataset:
+    ) -> Dataset:
         """A lazy Dataset of the population with one entry per take.
 
         Opening it only reads the records of the log; values are read and verified when
@@ -444,11 +444,11 @@ class Database:
 
     def source(
         self,
-        version: xr.DataTree,
+        version: DataTree,
         kind: str = "capture",
         take: str | None = None,
         groups: Sequence[str] | None = None,
-    ) -> xr.DataTree:
+    ) -> DataTree:
         """The input of this kind, and of this take if one is given, from which a
         version was made, or some groups of it.
         """

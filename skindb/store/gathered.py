@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache, partial
 
 import numpy as np
-import xarray as xr
+from xarray import Dataset
 
 from skindb.errors import InputError, input_error, require
 from skindb.schema.cohort import TAKE, Held, Values, combine, values_of
@@ -134,7 +134,7 @@ def blocks_of(place: Place, is_named: Callable[[str], bool]) -> list[str]:
 
 
 @lru_cache(MAX_OPEN_BLOCKS)
-def _opened(block: Block) -> xr.Dataset:
+def _opened(block: Block) -> Dataset:
     place = block.addresses[0].place
     stored = intact_or_none(partial(_stored, place, block.key))
     if stored is not None:
@@ -152,7 +152,7 @@ def _opened(block: Block) -> xr.Dataset:
     return gathered
 
 
-def _packed(key: str, block: xr.Dataset) -> bytes:
+def _packed(key: str, block: Dataset) -> bytes:
     """Content of the file of a block."""
     arrays = {str(name): v.values for name, v in block.variables.items()}
     for name, values in arrays.items():
@@ -163,7 +163,7 @@ def _packed(key: str, block: xr.Dataset) -> bytes:
     return packed(key, content.getvalue())
 
 
-def _stored(place: Place, key: str) -> xr.Dataset:
+def _stored(place: Place, key: str) -> Dataset:
     """The block in a file; `ValueError` if the file is damaged."""
     content = unpacked(key, place.read(key))
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
@@ -171,10 +171,10 @@ def _stored(place: Place, key: str) -> xr.Dataset:
     coords = {name: values.pop(name) for name in [*values] if name not in VARIABLES}
     coords[SEAL] = (TAKE, coords[SEAL])
     dims = {name: (TAKE, *VARIABLES[name].dims) for name in values}
-    return xr.Dataset({name: (dims[name], values[name]) for name in values}, coords)
+    return Dataset({name: (dims[name], values[name]) for name in values}, coords)
 
 
-def _read(address: Address) -> xr.Dataset:
+def _read(address: Address) -> Dataset:
     record = address.record()
     return require_recorded(record, "tables", read_tables(address.place, record))
 
@@ -187,7 +187,7 @@ def _place(url: str) -> Place:
     return place_at(url)
 
 
-def require_recorded(record: Record, name: str, ds: xr.Dataset) -> xr.Dataset:
+def require_recorded(record: Record, name: str, ds: Dataset) -> Dataset:
     """Return the group, which must match the description in its record that defines the
     layout of the cohort.
     """

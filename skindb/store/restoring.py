@@ -250,7 +250,7 @@ def _remove_left(place: Place) -> None:
 
 def _copy(archive: Archive, place: Place, item: Item) -> int:
     """Copy a file; returns its size."""
-    content = archive.read(item)
+    content = archive.parsed(bytes, item)
     place.create(item[0], content)
     return len(content)
 

@@ -13,8 +13,8 @@ from datetime import UTC, datetime
 from typing import Any, Self
 
 import numpy as np
-import xarray as xr
 import zarr
+from xarray import DataArray, Dataset, Variable
 from zarr.codecs import BloscCodec
 
 from skindb import __version__
@@ -120,7 +120,7 @@ class Stage:
         self._is_declared = kind in KINDS_OF_ONE_SUBJECT
         self.contents: Json = {}
         self.groups: set[str] = set()
-        self.tables: xr.Dataset | None = None
+        self.tables: Dataset | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -139,7 +139,7 @@ class Stage:
             self._guard()
 
     def write(
-        self, groups: Mapping[str, xr.Dataset], *, tables: xr.Dataset | None = None
+        self, groups: Mapping[str, Dataset], *, tables: Dataset | None = None
     ) -> None:
         """Write groups whose variables are all declared in the schema; lazy variables
         are computed shard by shard.
@@ -350,7 +350,7 @@ def read_names(place: Place, path: str) -> list[str] | None:
     return intact_or_none(read)
 
 
-def describe(ds: xr.Dataset) -> Json:
+def describe(ds: Dataset) -> Json:
     """Description of a group in a record: sizes, variables and short labels, which
     define the layout of a cohort.
     """
@@ -367,7 +367,7 @@ def describe(ds: xr.Dataset) -> Json:
     }
 
 
-def tables_to_json(tables: xr.Dataset) -> Json:
+def tables_to_json(tables: Dataset) -> Json:
     """Values and labels of a small Dataset of schema variables."""
     labels = {str(name): plain(coord.values) for name, coord in tables.coords.items()}
     return {
@@ -378,7 +378,7 @@ def tables_to_json(tables: xr.Dataset) -> Json:
     }
 
 
-def tables_from_json(content: Attributes) -> xr.Dataset:
+def tables_from_json(content: Attributes) -> Dataset:
     """The Dataset that was converted by `tables_to_json`; null becomes NaN."""
     values = {
         name: np.array(value, VARIABLES[name].dtype)
@@ -387,16 +387,16 @@ def tables_from_json(content: Attributes) -> xr.Dataset:
     return dataset(values, coords=content["labels"])
 
 
-def read_tables(place: Place, record: Record) -> xr.Dataset:
+def read_tables(place: Place, record: Record) -> Dataset:
     """The tables beside a version; empty if it has none."""
     if not record.tables:
-        return xr.Dataset()
+        return Dataset()
     return tables_from_json(
         json_object(read_beside(place, record, TABLES, record.tables))
     )
 
 
-def _faults(name: str, ds: xr.Dataset) -> list[Fault]:
+def _faults(name: str, ds: Dataset) -> list[Fault]:
     """Faults for which a group cannot be stored."""
     require_text(name, GROUP, "group")
     names = [str(v) for v in ds.data_vars]
@@ -411,7 +411,7 @@ def _faults(name: str, ds: xr.Dataset) -> list[Fault]:
     return faults
 
 
-def _whole_shards(ds: xr.Dataset) -> xr.Dataset:
+def _whole_shards(ds: Dataset) -> Dataset:
     """Copy with one dask block per shard, as two tasks in a shard would lose data, and
     with variable-length text.
     """
@@ -451,11 +451,11 @@ def _shards(values: np.ndarray[Any, Any], rows: int) -> Any:
     )
 
 
-def _row_bytes(array: xr.DataArray | xr.Variable) -> int:
+def _row_bytes(array: DataArray | Variable) -> int:
     return int(array.dtype.itemsize * math.prod(array.shape[1:]))
 
 
-def _object_rows(array: xr.DataArray | xr.Variable) -> int:
+def _object_rows(array: DataArray | Variable) -> int:
     """Elements along the first dim in one object; whole blocks of surfels."""
     rows = MAX_OBJECT_BYTES // max(_row_bytes(array), 1)
     if array.dims[:1] == ("surfel",):
@@ -463,7 +463,7 @@ def _object_rows(array: xr.DataArray | xr.Variable) -> int:
     return max(rows, 1)
 
 
-def _encoding(array: xr.DataArray) -> Json:
+def _encoding(array: DataArray) -> Json:
     if array.dtype.kind not in "fiub" or array.ndim == 0 or array.size == 0:
         return {}
     length, *rest = array.shape

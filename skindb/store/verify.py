@@ -5,7 +5,7 @@ faults are reported together.
 import re
 from functools import partial
 
-import xarray as xr
+from xarray import open_datatree
 
 from skindb.errors import Fault, InputError
 from skindb.store.audit import BLOCK_NAME, ENTRY_NAME, read_audit
@@ -268,7 +268,7 @@ def _difference(place: Place, key: str, file: Committed) -> str:
 def _record_faults(place: Place, record: Record, tables: bytes) -> list[Fault]:
     """Faults of a record that does not agree with the attributes of its version."""
     store = VerifiedStore(place, record)
-    tree = xr.open_datatree(store, engine="zarr", consolidated=False, chunks=None)  # type: ignore[arg-type]
+    tree = open_datatree(store, engine="zarr", consolidated=False, chunks=None)  # type: ignore[arg-type]
     root = json_object(place.read_small(f"{record.path}/zarr.json"))
     wrong = [] if root.get("attributes") == record.provenance else ["provenance"]
     if record.kind not in KINDS_OF_ONE_SUBJECT:

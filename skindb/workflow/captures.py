@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
+from xarray import Dataset
 
 from skindb.calibration.cameras import calibrate_cameras, calibrated_cameras
 from skindb.calibration.fibres import calibrate_probe, calibrated_probe
@@ -348,7 +348,7 @@ def calibrate(
     key = require_text(name, NAME.pattern, "name of a calibration")
     require_kind_of_calibration(db, key, rig=False)
     dome = read_setup_dome(Path(setup))
-    groups = dict[str, xr.Dataset]()
+    groups = dict[str, Dataset]()
     if frames := read_calibration_frames(dome):
         if frames.ball is not None:
             groups["position_calibration"] = calibrate_positions(dome, frames.ball)
@@ -472,7 +472,7 @@ def describe_calibration(db: Database, record: Record) -> Json:
     return description | {"ingest_again": takes_of_earlier(db, record)}
 
 
-def _describe_lights(lights: xr.Dataset) -> Json:
+def _describe_lights(lights: Dataset) -> Json:
     """Number of the lights and errors of their intensities."""
     error = lights[variables.CALIBRATED_INTENSITY_ERROR]
     relative = (error / lights[variables.CALIBRATED_INTENSITY]).max("channel")
@@ -488,7 +488,7 @@ def _describe_lights(lights: xr.Dataset) -> Json:
     }
 
 
-def _largest_change(lights: xr.Dataset, before: xr.Dataset) -> Json:
+def _largest_change(lights: Dataset, before: Dataset) -> Json:
     """Largest change of the intensity of a light that two versions have."""
     name = variables.CALIBRATED_INTENSITY
     change = abs(lights[name] / before[name] - 1).max(dim="channel")
@@ -500,13 +500,13 @@ def _largest_change(lights: xr.Dataset, before: xr.Dataset) -> Json:
     }
 
 
-def _groups(db: Database, record: Record, generation: int) -> dict[str, xr.Dataset]:
+def _groups(db: Database, record: Record, generation: int) -> dict[str, Dataset]:
     """The groups of a version of a calibration, in memory."""
     stored = db.read(CALIBRATION, record.take, generation=generation)
     return {name: group.to_dataset().load() for name, group in stored.children.items()}
 
 
-def _describe_cameras(calibration: xr.Dataset) -> Json:
+def _describe_cameras(calibration: Dataset) -> Json:
     """How many cameras each calibration has, and the worst of each measure of it."""
     measures = {
         "dark frames": variables.DEFECT_PIXELS,

@@ -10,7 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
+from xarray import Dataset, DataTree, merge
 
 from skindb.analysis.regions import take_masks
 from skindb.analysis.registration import (
@@ -127,15 +127,15 @@ def summary_parameters(*, size: int | None = None) -> Json:
     return parameters if size is None else parameters | {"size": size}
 
 
-def model_with_summary(model: xr.DataTree) -> xr.DataTree:
+def model_with_summary(model: DataTree) -> DataTree:
     """A model with what cohorts need of it: a sample of its surfels, and tables."""
     groups = groups_of(model) | sample_groups(model) | {TABLES: tables_of(model)}
-    version = xr.DataTree.from_dict(groups)
+    version = DataTree.from_dict(groups)
     version.attrs = model.attrs
     return version
 
 
-def tables_of(model: xr.DataTree) -> xr.Dataset:
+def tables_of(model: DataTree) -> Dataset:
     """What is kept beside a model: its summary for cohorts, and how well it predicts."""
     tables = summary_tables(model)
     prediction = prediction_table(model["fitted"].to_dataset().load())
@@ -143,12 +143,12 @@ def tables_of(model: xr.DataTree) -> xr.Dataset:
     rows = prediction.reindex(
         region=tables["region"].values, fill_value={variables.PREDICTION_SURFELS: 0}
     )
-    return xr.merge(
+    return merge(
         [tables, rows], combine_attrs="override", join="outer", compat="no_conflicts"
     )
 
 
-def sample_groups(model: xr.DataTree) -> dict[str, xr.Dataset]:
+def sample_groups(model: DataTree) -> dict[str, Dataset]:
     """The group "sample" of a model; none if no surfel was fitted."""
     if not bool(
         (model["fitted"].to_dataset()[variables.FIT_STATUS] == FitStatus.FITTED).any()
@@ -158,11 +158,11 @@ def sample_groups(model: xr.DataTree) -> dict[str, xr.Dataset]:
 
 
 def registered_parts(
-    model: xr.DataTree,
-    registered: xr.Dataset,
+    model: DataTree,
+    registered: Dataset,
     *,
     size: int = SIZE,
-) -> dict[str, xr.Dataset]:
+) -> dict[str, Dataset]:
     """Groups and tables that cohorts need of a registered take: maps, and the regions
     that its landmarks give.
     """
@@ -202,7 +202,7 @@ def _map(db: Database, request: CohortRequest, record: Record) -> Record:
     )
 
 
-def _registered_model(db: Database, record: Record) -> tuple[xr.DataTree, xr.Dataset]:
+def _registered_model(db: Database, record: Record) -> tuple[DataTree, Dataset]:
     """The model of a registration, and the group "registration"."""
     version = db.read(
         "registration",
@@ -217,7 +217,7 @@ def _registered_model(db: Database, record: Record) -> tuple[xr.DataTree, xr.Dat
 def _commit_summary(
     db: Database,
     record: Record,
-    groups: dict[str, xr.Dataset],
+    groups: dict[str, Dataset],
     parameters: Json,
 ) -> Record:
     derivation = Derivation.of(
@@ -230,7 +230,7 @@ def _commit_summary(
         parameters=parameters,
         summary_parameters=parameters,
     )
-    summary = xr.DataTree.from_dict(groups)
+    summary = DataTree.from_dict(groups)
     summary.attrs["consent_scope"] = record.provenance.get("consent_scope", [])
     return derivation.commit(summary)
 
@@ -369,7 +369,7 @@ def _derivation(db: Database, models: Iterable[Record], reference: str) -> Deriv
 
 def registered_datasets(
     db: Database, records: Mapping[str, Record]
-) -> dict[str, xr.Dataset]:
+) -> dict[str, Dataset]:
     """The group "registration" of versions; what belongs to no surfel is in memory."""
     out = {}
     for take, record in records.items():
@@ -399,7 +399,7 @@ def _register(
     )
     registered = register_one(take, model, template, frame)
     groups = registered_parts(model, registered)
-    version = xr.DataTree.from_dict({"registration": registered} | groups)
+    version = DataTree.from_dict({"registration": registered} | groups)
     version.attrs["consent_scope"] = model.attrs.get("consent_scope", [])
     return replace(derivation, key=take).commit(version)
 

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
+from xarray import Dataset, DataTree
 
 from skindb.cache import cached_arrays
 from skindb.files import ROOT, package_digest, plain
@@ -340,7 +340,7 @@ class Derivation:
         record = self.db.record(self.kind, self.key)
         return record if self.describes(record) else None
 
-    def commit(self, version: xr.DataTree, lease: Lease | None = None) -> Record:
+    def commit(self, version: DataTree, lease: Lease | None = None) -> Record:
         """Commit a version that was computed, with its attributes.
 
         A group "tables" is kept beside the version, where cohorts read it.
@@ -355,7 +355,7 @@ class Derivation:
             return stage.commit({**defaults, **attrs, **self.provenance})
 
 
-def derive(derivation: Derivation, compute: Callable[[], xr.DataTree]) -> Record:
+def derive(derivation: Derivation, compute: Callable[[], DataTree]) -> Record:
     """The stored version if it is current, or a new one, which is computed and committed.
 
     Parameters
@@ -368,6 +368,6 @@ def derive(derivation: Derivation, compute: Callable[[], xr.DataTree]) -> Record
     return derivation.current() or derivation.commit(compute())
 
 
-def groups_of(tree: xr.DataTree) -> dict[str, xr.Dataset]:
+def groups_of(tree: DataTree) -> dict[str, Dataset]:
     """The groups of a DataTree as Datasets."""
     return {str(name): node.to_dataset() for name, node in tree.children.items()}

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
+from xarray import DataTree
 
 from skindb.analysis.brdf import population_basis
 from skindb.analysis.edit import apply_traits, with_basis
@@ -36,9 +36,9 @@ STRENGTHS = (0.5, 1.0)  # of the edits in a grid, as in figure 19 of the paper
 class Editable:
     """A model, what moves it, and the versions both are from."""
 
-    model: xr.DataTree
+    model: DataTree
     study: str
-    move: Callable[[Mapping[str, float]], xr.DataTree]
+    move: Callable[[Mapping[str, float]], DataTree]
     derivation: Derivation  # without the amounts
 
     def derivation_by(self, amounts: Mapping[str, float]) -> Derivation:
@@ -59,7 +59,7 @@ def edit(
     *,
     study: str | None = None,
     dictionary: Path | None = None,
-) -> xr.DataTree:
+) -> DataTree:
     """Move the model of a take along traits and commit it as the kind "edit".
 
     If the newest edit is this one already, nothing is computed.
@@ -103,7 +103,7 @@ def edit_grid(
     dictionary: Path | None = None,
     progress: Progress = silent,
     **options: Any,
-) -> dict[str, xr.DataTree]:
+) -> dict[str, DataTree]:
     """Draw a model and edits of it, one row each, with one exposure for all; nothing is
     committed (figure 19).
 
@@ -220,7 +220,7 @@ def _root_mean_square(values: Float32) -> float:
     return float(np.sqrt((values**2).mean()))
 
 
-def _frontal_light(model: xr.DataTree) -> str:
+def _frontal_light(model: DataTree) -> str:
     """The light whose direction is nearest to that of the frontal camera."""
     dome = model["dome"].to_dataset().load()
     seen_from = dome[variables.CAMERA_POSITION].values[frontal_camera(dome)]
@@ -229,7 +229,7 @@ def _frontal_light(model: xr.DataTree) -> str:
     return str(dome["light"].values[int(np.argmax(cosine))])
 
 
-def _grid_scale(model: xr.DataTree) -> float:
+def _grid_scale(model: DataTree) -> float:
     """Size of the pictures of a grid over that of the camera's: few pixels, of which
     each costs every light.
     """
@@ -237,7 +237,7 @@ def _grid_scale(model: xr.DataTree) -> float:
     return GRID_SIDE / float(dome[variables.CAMERA_SIZE].max())
 
 
-def _sides(edited: xr.DataTree) -> str:
+def _sides(edited: DataTree) -> str:
     """How many takes the traits of a row follow from."""
     return "\n".join(
         note.partition(": ")[2].partition(";")[0]
@@ -268,7 +268,7 @@ def editable_model(
         brdfs, float(model[f"basis/{variables.DISC_ANGULAR_RADIUS}"]), dictionary
     )
 
-    def move(amounts: Mapping[str, float]) -> xr.DataTree:
+    def move(amounts: Mapping[str, float]) -> DataTree:
         return apply_traits(
             model,
             amounts=amounts,
@@ -293,7 +293,7 @@ def editable_model(
 
 
 def _registered_textures(
-    db: Database, take: str, model: xr.DataTree, vectors: xr.DataTree
+    db: Database, take: str, model: DataTree, vectors: DataTree
 ) -> tuple[dict[str, Any], list[Record]]:
     """What moves the texture of a registered take: arguments of `apply_traits`, and the
     record of its registration; nothing for other takes.

@@ -6,7 +6,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import xarray as xr
+from xarray import DataTree
 
 from skindb.errors import InputError, input_error
 from skindb.files import Attributes
@@ -129,7 +129,7 @@ def fit_derivation(
     )
 
 
-def _stored_first_pass(scratch: Path, take: str) -> xr.DataTree | None:
+def _stored_first_pass(scratch: Path, take: str) -> DataTree | None:
     """The first pass of a killed fit that would give the same model, in memory."""
     db = Database(scratch)
     try:
@@ -139,13 +139,13 @@ def _stored_first_pass(scratch: Path, take: str) -> xr.DataTree | None:
         groups = {name: ds.compute() for name, ds in groups_of(stored).items()}
     except InputError:  # damaged: it is repeated
         return None
-    first_pass_tree = xr.DataTree.from_dict(groups)
+    first_pass_tree = DataTree.from_dict(groups)
     first_pass_tree.attrs = stored.attrs
     return first_pass_tree
 
 
 def _store_first_pass(
-    db: Database, scratch: Path, take: str, first_tree: xr.DataTree
+    db: Database, scratch: Path, take: str, first_tree: DataTree
 ) -> None:
     """Keep a first pass for the case that the fit is killed, in a database of its own,
     whose name contains a digest of all that decides the model.

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import xarray as xr
+from xarray import DataTree
 
 from skindb.errors import InputError, input_error
 from skindb.export.bundle import export_bundle
@@ -172,7 +172,7 @@ def export_take(
 
 def _model(
     db: Database, take: str, generation: int | None, *, edited: bool = False
-) -> xr.DataTree:
+) -> DataTree:
     """A model or an edit whose subject agrees to exports; a stale edit is refused, or warned of."""
     kind = "edit" if edited else "model"
     model = db.read(kind, take, generation=generation)
@@ -283,7 +283,7 @@ def _diffusion_lengths(db: Database, site: str) -> dict[str, float]:
     return lengths
 
 
-def _nose(model: xr.DataTree) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _nose(model: DataTree) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Tip of the nose (3,), or the middle of the surfels."""
     mesh = model["mesh"].to_dataset()
     if variables.LANDMARK_POSITION in mesh and LANDMARK in [
@@ -295,7 +295,7 @@ def _nose(model: xr.DataTree) -> np.ndarray[Any, np.dtype[np.float64]]:
     )
 
 
-def _light(model: xr.DataTree) -> Lights:
+def _light(model: DataTree) -> Lights:
     """A small light to the subject's left."""
     turn = np.radians(LIGHT_DEGREES)
     towards = np.array([np.sin(turn), 0.15, np.cos(turn)])
@@ -312,7 +312,7 @@ def _light(model: xr.DataTree) -> Lights:
     )
 
 
-def _close_up(model: xr.DataTree) -> Camera:
+def _close_up(model: DataTree) -> Camera:
     """A camera that looks at the edge of the nose's shadow from the front."""
     frontal, _ = chosen_camera(model["dome"].to_dataset().load(), None)
     # beside the nose, on the side away from the light
@@ -492,11 +492,11 @@ def explain_view(
 def _moved(
     db: Database,
     take: str,
-    model: xr.DataTree,
+    model: DataTree,
     traits: Mapping[str, float],
     study: str | None,
     dictionary: Path | None,
-) -> tuple[xr.DataTree, tuple[Trait, ...]]:
+) -> tuple[DataTree, tuple[Trait, ...]]:
     """The model on the basis of its edits, and the edits."""
     if not traits:
         return model, ()
@@ -509,7 +509,7 @@ def _moved(
     return plain, tuple(moved)
 
 
-def _attributes(db: Database, take: str, model: xr.DataTree) -> Json:
+def _attributes(db: Database, take: str, model: DataTree) -> Json:
     attributes = {name: model.attrs[name] for name in SHOWN if name in model.attrs}
     traits = (
         db.record("capture", take).provenance.get("traits", {})

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
+from xarray import DataTree
 
 from skindb.errors import InputError, require
 from skindb.files import Json, make_private, private_file, private_umask
@@ -151,7 +151,7 @@ def _remove_left() -> None:
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def _write_maps(model: xr.DataTree, out: Path, step: int) -> Json:
+def _write_maps(model: DataTree, out: Path, step: int) -> Json:
     """Write the maps on the grid of the points, and describe them."""
     fitted = model["fitted"].to_dataset().load()
     dome = model["dome"].to_dataset()

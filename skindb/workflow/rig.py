@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import xarray as xr
+from xarray import DataArray, Dataset, DataTree
 
 from skindb.calibration.lights import is_same_rig, moved_lights
 from skindb.errors import input_error, require
@@ -82,7 +82,7 @@ def calibrate_rig(
     )
     inputs = list[Record]()
     residuals = list[tuple[LightResiduals, dict[str, Float64]]]()
-    cameras = list[xr.DataArray]()
+    cameras = list[DataArray]()
     gloss = list[TakeGloss | None]()
     positions = dict[str, Float64]()
     for number, (take, model) in enumerate(models.items()):
@@ -191,7 +191,7 @@ def _models(db: Database, takes: Sequence[str]) -> dict[str, Record]:
     return found
 
 
-def _lights(record: Record, capture: xr.DataTree) -> dict[str, Float64]:
+def _lights(record: Record, capture: DataTree) -> dict[str, Float64]:
     """Stated position (3,) mm of each light of a capture, whose intensities must be its own."""
     take = record.take
     rule = "a calibration from takes needs captures with a dome"
@@ -237,7 +237,7 @@ def _require_rig(
     )
 
 
-def _require_help(group: xr.Dataset) -> None:
+def _require_help(group: Dataset) -> None:
     """Require lights or cameras that are not as stated, or lobes."""
     if (
         (group[variables.RIG_LIGHT_GAIN] != 1).any()

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import xarray as xr
 from dask.delayed import Delayed, delayed
+from xarray import Dataset, DataTree
 
 from skindb.analysis.long_form import tidy
 from skindb.analysis.regions import common_landmarks
@@ -115,7 +115,7 @@ def open_population(
     else:
         cohort = open_models("tables")
     registrations: Mapping[str, Record] = {}
-    frames: dict[str, xr.Dataset] = {}
+    frames: dict[str, Dataset] = {}
     notes: list[Note] = []
     if study.registers:
         if not takes:  # before anything is registered
@@ -127,7 +127,7 @@ def open_population(
     registered = [*registrations]
     open_registered = partial(opened, takes=registered)
 
-    def open_cohort(layout: Any, **options: Any) -> xr.Dataset:
+    def open_cohort(layout: Any, **options: Any) -> Dataset:
         if layout != "maps" and "kind" not in options:
             return open_models(layout, **options)
         size = {"size": options["size"]} if "size" in options else {}
@@ -149,9 +149,7 @@ def open_population(
     return population, [*_models(db, cohort), *registrations.values()]
 
 
-def _opened(
-    db: Database, layout: Any, *, mixed_fits: bool, **options: Any
-) -> xr.Dataset:
+def _opened(db: Database, layout: Any, *, mixed_fits: bool, **options: Any) -> Dataset:
     """A cohort that states whether its takes may be fitted with different parameters."""
     return db.cohort(layout, **options).assign_attrs(mixed_fits=mixed_fits)
 
@@ -201,10 +199,10 @@ def _require_one_scale(db: Database, study: Study, inputs: Sequence[Record]) -> 
 
 def _open_maps(
     db: Database,
-    models: xr.Dataset,
+    models: Dataset,
     registered: Sequence[str],
-    open_maps: Callable[[], xr.Dataset],
-) -> xr.Dataset:
+    open_maps: Callable[[], Dataset],
+) -> Dataset:
     """Maps of the registered takes; without a probe there is no map of sigma_tr."""
     if not registered:
         raise input_error(
@@ -218,7 +216,7 @@ def _open_maps(
     return maps.assign_attrs(skipped=unique_notes(skipped))
 
 
-def _models(db: Database, cohort: xr.Dataset) -> list[Record]:
+def _models(db: Database, cohort: Dataset) -> list[Record]:
     """Records of the models of a cohort."""
     takes = cohort["take"].values
     generations = cohort["model_generation"].values
@@ -230,7 +228,7 @@ def _models(db: Database, cohort: xr.Dataset) -> list[Record]:
 
 
 def _brdf_tables(
-    open_models: Callable[..., xr.Dataset], cohort: xr.Dataset, dictionary: Path | None
+    open_models: Callable[..., Dataset], cohort: Dataset, dictionary: Path | None
 ) -> Delayed:
     """The tables of the fits, computed once, where the study is: they travel to no
     other process by themselves.
@@ -275,7 +273,7 @@ def require_covered(db: Database, release: str | None) -> None:
 
 
 def _registrations(
-    db: Database, cohort: xr.Dataset, release: str | None
+    db: Database, cohort: Dataset, release: str | None
 ) -> tuple[dict[str, Record], str]:
     """Registrations of the takes of a cohort that can have one, and where they are
     from; a release is never registered again.
@@ -307,7 +305,7 @@ def study(
     release: str | None = None,
     name: str | None = None,
     **parameters: Any,
-) -> xr.DataTree:
+) -> DataTree:
     """The stored study if it is current, or a new one, which is computed and committed.
 
     Parameters
@@ -351,7 +349,7 @@ def study(
         derivation = _derivation(db, key, record, requested, population, inputs)
         # the file of a dictionary may change: a study with one is always computed
         if dictionary is not None or derivation.current() is None:
-            version = xr.DataTree.from_dict(record.compute(population, chosen))
+            version = DataTree.from_dict(record.compute(population, chosen))
             if population.notes:
                 version.attrs["registration"] = population.notes
             derivation.commit(version)
@@ -409,13 +407,13 @@ def study_key(record: Study, requested: Attributes, name: str | None) -> str:
     return f"{record.name}.{text}"
 
 
-def study_function(record: Study) -> Callable[..., xr.DataTree]:
+def study_function(record: Study) -> Callable[..., DataTree]:
     """Function of a database that makes one study, with its parameters in signature and
     docstring, for notebooks.
     """
 
     @wraps(study)
-    def function(db: Database, **options: Any) -> xr.DataTree:
+    def function(db: Database, **options: Any) -> DataTree:
         return study(db, record.name, **options)
 
     general = inspect.signature(study).parameters
@@ -533,7 +531,7 @@ def _derivation(
     )
 
 
-def _attributes_digest(cohort: xr.Dataset) -> str:
+def _attributes_digest(cohort: Dataset) -> str:
     """Digest of the coordinates that describe the takes: age, gender, condition,
     parameters of the fit.
     """
