@@ -11,7 +11,7 @@ from test_cli import _run
 import skindb
 from skindb.store import Database
 from skindb.store.folder import Folder
-from skindb.store.markers import subject_hash
+from skindb.store.markers import keyed_hash, require_secret
 from skindb.workflow import audit, pictures
 
 pytestmark = pytest.mark.slow
@@ -112,7 +112,8 @@ def test_command__logs_one_entry(
     [entry] = entries
     assert (entry.action, entry.actor, entry.parameters) == (action, "anna", parameters)
     assert entry.subjects == sorted(
-        subject_hash(Folder(fitted_database.root), one) for one in subjects
+        keyed_hash(require_secret(Folder(fitted_database.root)), one)
+        for one in subjects
     )
 
 
@@ -227,7 +228,7 @@ def test_ingest__of_each_capture_is_an_entry(tmp_path):
     assert [(entry.action, entry.counts) for entry in entries] == [
         ("ingest", {"takes": 1})
     ] * 2
-    assert entries[0].subjects == [subject_hash(Folder(db.root), "V001")]
+    assert entries[0].subjects == [keyed_hash(require_secret(Folder(db.root)), "V001")]
     assert _run("ingest", str(db.root), takes[0], "--spacing", "7").returncode == 0
     assert len(db.audit(subject="V001")[0]) == 3
     shutil.rmtree(tmp_path / "db")

@@ -170,18 +170,6 @@ class Archive:
             if (match := STATE.fullmatch(name))
         ]
 
-    def newest(self) -> int:
-        """Number of the newest state; `InputError` if there is none."""
-        numbers = self.numbers()
-        require(
-            numbers,
-            self.place.name,
-            "a backup must hold a state",
-            "none",
-            "run skindb backup again",
-        )
-        return numbers[-1]
-
     def state(self, number: int) -> State:
         """A state; `InputError` if it does not exist or is damaged."""
         key = f"{STATES}/{number:06d}.json"

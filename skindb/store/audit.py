@@ -111,10 +111,10 @@ def append_entry(
     }
     for _ in range(MAX_ATTEMPTS):
         newest = _last_number(place)
-        body = fields | {
-            "number": newest + 1,
-            "previous": _seal_of_entry(place, secret, newest),
-        }
+        before = _outcome(place, secret, newest) if newest else None
+        # `read_audit` reports one that cannot be read
+        seal = before.seal if isinstance(before, AuditEntry) else ""
+        body = fields | {"number": newest + 1, "previous": seal}
         key = entry_key(newest + 1)
         content = json.dumps(body | {"seal": keyed_seal(secret, key, body)}).encode()
         if place.create(key, content):
@@ -195,12 +195,6 @@ def _numbers(place: Place, block: str) -> list[int]:
     names = place.children(folder, links=True)
     numbers = [int(name[:9]) for name in names if re.fullmatch(ENTRY_NAME, name)]
     return [number for number in numbers if entry_key(number).startswith(folder)]
-
-
-def _seal_of_entry(place: Place, secret: bytes, number: int) -> str:
-    """Seal of an entry; empty if it cannot be read, which `read_audit` reports."""
-    outcome = _outcome(place, secret, number) if number else None
-    return outcome.seal if isinstance(outcome, AuditEntry) else ""
 
 
 def _outcome(place: Place, secret: bytes, number: int) -> AuditEntry | Fault:

@@ -315,8 +315,10 @@ def _draft(place: Place, markers: Markers) -> Draft:
     ]
     items: list[Item] = []
     files |= intact(partial(_digest, place), small_files, faults)
-    for _, those in intact(partial(_version_items, place), records.values(), faults):
-        items += those
+    for record, manifest in intact(
+        partial(read_manifest, place), records.values(), faults
+    ):
+        items += items_of(record, manifest)
     items += [(key, digest, None) for key, digest in files.items()]
     additions = {}
     for key, content in texts.items():
@@ -363,10 +365,6 @@ def _require_unchanged(
     tombstones = {f"tombstones/{name}" for name in place.children("tombstones")}
     if faults and not tombstones <= listing.keys():
         raise Changed
-
-
-def _version_items(place: Place, record: Record) -> list[Item]:
-    return items_of(record, read_manifest(place, record))
 
 
 def _digest(place: Place, key: str) -> str:

@@ -56,7 +56,7 @@ from skindb.store.snapshot import (
     pins_of,
 )
 from skindb.store.stage import Stage, read_tables
-from skindb.store.stale import Request, read_requests, remove_request
+from skindb.store.stale import Request, read_requests
 from skindb.store.verify import database_faults
 
 
@@ -547,7 +547,7 @@ class Database:
 
     def fulfil(self, request: Request) -> None:
         """Remove a request, because its result was computed."""
-        remove_request(self.place, request)
+        self.place.remove(request.key)
 
     def info(
         self,

@@ -7,7 +7,7 @@ removed, so that any run can complete an erasure that was interrupted.
 import errno
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -43,7 +43,6 @@ from skindb.store.stale import (
     TAKES,
     Request,
     read_requests,
-    remove_request,
     write_request,
 )
 
@@ -118,7 +117,8 @@ def holdings_of(place: Place, markers: Markers) -> Holdings:
     """
     if not markers.hashes:
         return Holdings()
-    records = _every_record(place)
+    # the newest of each kind and take after the others
+    records = list(chain(*in_parallel(Log.readable, committed_logs(place))))
     doomed = _doomed(records, markers)
     newest = {(record.kind, record.take): record for record in records}
     current = {_key(record) for record in newest.values()}
@@ -126,7 +126,7 @@ def holdings_of(place: Place, markers: Markers) -> Holdings:
     unrecorded, damaged = _unrecorded(place, markers, named)
     return Holdings(
         takes={
-            (kind, take): _count(place, kind, take)
+            (kind, take): len(Log(place, kind, take).generations())
             for kind, take in _own_takes(place, markers)
         },
         versions=tuple(doomed),
@@ -138,7 +138,12 @@ def holdings_of(place: Place, markers: Markers) -> Holdings:
             for request in read_requests(place)[0]
             if request.without(markers.is_withdrawn) != request
         ),
-        scratch=tuple(_scratch(place, markers)),
+        scratch=tuple(
+            path
+            for path in _scratch(place)
+            if (match := SCRATCH_NAME.fullmatch(path.name))
+            and markers.is_withdrawn(subject_of(match[1]))
+        ),
         caches=(
             *catalogue_blocks_of(place, markers.is_withdrawn),
             *blocks_of(place, markers.is_withdrawn),
@@ -252,8 +257,10 @@ def _erase_holdings(
     place: Place, holdings: Holdings, markers: Markers, erasure: Erasure
 ) -> None:
     """Remove everything that was found, results after the requests to compute them again."""
-    for folder in [*holdings.scratch, *_abandoned_scratch(place)]:
-        remove_tree(folder)
+    for folder in _scratch(place):
+        # the name of one whose removal was interrupted does not tell whose data it holds
+        if folder in holdings.scratch or folder.name.endswith(ABANDONED_SCRATCH):
+            remove_tree(folder)
     for (kind, take), number in holdings.takes.items():
         _erase_take(place, kind, take)
         erasure.removed += Counter({kind: number})
@@ -327,15 +334,6 @@ def _remove_record(place: Place, record: Record) -> None:
     except InputError:
         if record.generation in log.generations():
             raise
-
-
-def _count(place: Place, kind: str, take: str) -> int:
-    return len(Log(place, kind, take).generations())
-
-
-def _every_record(place: Place) -> list[Record]:
-    """All readable records, the newest of each kind and take after the others."""
-    return list(chain(*in_parallel(Log.readable, committed_logs(place))))
 
 
 def _doomed(records: Iterable[Record], markers: Markers) -> list[Record]:
@@ -452,25 +450,10 @@ def _is_admitted(place: Place, markers: Markers, path: str, subjects: set[str]) 
     return not any(map(markers.is_withdrawn, subjects.union(map(subject_of, names))))
 
 
-def _scratch(place: Place, markers: Markers) -> Iterator[Path]:
-    """Scratch folders of ingests of withdrawn subjects on this machine."""
+def _scratch(place: Place) -> list[Path]:
+    """Scratch folders on this machine."""
     folder = place.scratch()
-    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-        match = SCRATCH_NAME.fullmatch(path.name)
-        if match and markers.is_withdrawn(subject_of(match[1])):
-            yield path
-
-
-def _abandoned_scratch(place: Place) -> list[Path]:
-    """Scratch folders whose removal was interrupted; their names do not tell whose data
-    they hold.
-    """
-    folder = place.scratch()
-    return (
-        [path for path in folder.iterdir() if path.name.endswith(ABANDONED_SCRATCH)]
-        if folder.is_dir()
-        else []
-    )
+    return sorted(folder.iterdir()) if folder.is_dir() else []
 
 
 def _replace_request(
@@ -479,7 +462,7 @@ def _replace_request(
     """Take withdrawn subjects out of a request."""
     changed = request.without(markers.is_withdrawn)
     if changed is None:
-        remove_request(place, request)
+        place.remove(request.key)
     else:
         _with_space(place, holdings, partial(write_request, place, changed))
 

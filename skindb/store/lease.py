@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Self
 
 from skindb.clock import SYSTEM_CLOCK, Clock
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, input_error
 from skindb.files import Attributes, Json
 from skindb.store.markers import WithdrawalGuard, WithdrawnError
 from skindb.store.place import (
@@ -153,7 +153,13 @@ class Lease:
         try:
             while (holder := self._claim_all()) is not None:
                 if (remaining := end - self._clock.monotonic()) <= 0:
-                    raise InputError(_held_fault(holder))
+                    raise input_error(
+                        _lease_name(holder.key),
+                        ONE_RUN,
+                        str(holder),
+                        "wait for it (--wait SECONDS) or end it; its lease expires "
+                        f"{holder.seconds:.0f} s after its last renewal",
+                    )
                 self._clock.sleep(min(POLL_SECONDS, remaining))
         except BaseException:  # for example an interrupt or a full disk
             self._release()
@@ -252,10 +258,9 @@ class Lease:
                 self.place.remove(_file_key(key, number))
             return now or Claim(key, number, {})
         self._held[key] = number
-        for older in (
-            earlier for earlier in _numbers(self.place, key) if earlier < number
-        ):
-            self.place.remove(_file_key(key, older))
+        for older in _numbers(self.place, key):
+            if older < number:
+                self.place.remove(_file_key(key, older))
         return None
 
     def _release(self) -> None:
@@ -349,16 +354,6 @@ def _file_key(key: str, number: int) -> str:
 def _lease_name(key: str) -> str:
     _, kind, take = key.split("/")
     return f"{kind} of {take}"
-
-
-def _held_fault(claim: Claim) -> Fault:
-    return Fault(
-        _lease_name(claim.key),
-        ONE_RUN,
-        str(claim),
-        "wait for it (--wait SECONDS) or end it; its lease expires "
-        f"{claim.seconds:.0f} s after its last renewal",
-    )
 
 
 def _lost_fault(key: str, newest: Claim | None) -> Fault:

@@ -137,13 +137,6 @@ class WithdrawalGuard:
             raise WithdrawnError(faults)
 
 
-def subject_hash(place: Place, subject: str) -> str:
-    """Hash of a pseudonym that only shows whose it is to who knows the secret of the
-    database, created if absent.
-    """
-    return keyed_hash(require_secret(place), subject)
-
-
 def require_secret(place: Place) -> bytes:
     """The random bytes of the database, which are created if there are none and nothing
     was made with them.

@@ -127,7 +127,8 @@ def restore(
     place.is_unlocked = True
     require_apart(archive.place, place)
     _require_empty(place)
-    state = archive.state(archive.newest() if number is None else number)
+    newest = max(archive.numbers(), default=0)
+    state = archive.state(newest if number is None else number)
     notes = Notes()
     if not without_markers:
         notes = read_marker_file(file, require_secret(archive.place))

@@ -298,11 +298,6 @@ def request_content(request: Request) -> bytes:
     return sealed(asdict(request))
 
 
-def remove_request(place: Place, request: Request) -> None:
-    """Remove a request."""
-    place.remove(request.key)
-
-
 def read_requests(place: Place) -> tuple[list[Request], list[Fault]]:
     """The readable requests, and the faults of the others."""
     requests: list[Request] = []

@@ -83,7 +83,9 @@ def database_faults(place: Place) -> list[Fault]:
         damaged |= {log.what} if broken else set()
         for record in readable:
             if log.is_removed(record.seal):
-                faults.append(_partly_removed_fault(record))
+                rule = "its removal must be completed"
+                finding = "both a record and a tombstone"
+                faults.append(Fault(record.title, rule, finding, "run skindb clean"))
             else:
                 faults += version_faults(place, record)
     faults += _input_faults(place, records, damaged)
@@ -168,15 +170,9 @@ def _input_faults(
             if log.what in damaged or log.is_removed(reference["seal"]):
                 continue
             if seals.get((log.kind, log.take, generation)) != reference["seal"]:
-                by = record.title
-                faults.append(
-                    Fault(
-                        log.what,
-                        f"generation {generation}, from which {by} was made, must exist",
-                        "no record, or a different one",
-                        RESTORE,
-                    )
-                )
+                rule = f"generation {generation}, from which {record.title} was made, must exist"
+                finding = "no record, or a different one"
+                faults.append(Fault(log.what, rule, finding, RESTORE))
     return faults
 
 
@@ -236,16 +232,6 @@ def version_faults(place: Place, record: Record) -> list[Fault]:
         return list(error.faults)
 
 
-def _partly_removed_fault(record: Record) -> Fault:
-    title = record.title
-    return Fault(
-        title,
-        "its removal must be completed",
-        "both a record and a tombstone",
-        "run skindb clean",
-    )
-
-
 def _file_fault(
     place: Place, record: Record, manifest: Manifest, sizes: dict[str, int], name: str
 ) -> Fault | None:
@@ -281,9 +267,5 @@ def _record_faults(place: Place, record: Record, tables: bytes) -> list[Fault]:
     )
     wrong += [] if contents == record.contents else ["contents"]
     wrong += [] if sum(place.sizes(record.path).values()) == record.bytes else ["bytes"]
-    title = record.title
-    return (
-        [Fault(title, AS_RECORDED, f"different {', '.join(wrong)}", RESTORE)]
-        if wrong
-        else []
-    )
+    finding = f"different {', '.join(wrong)}"
+    return [Fault(record.title, AS_RECORDED, finding, RESTORE)] if wrong else []

@@ -245,7 +245,7 @@ def plan_withdrawal(
     if entry is not None:
         removed |= Counter(entry.get("removed", {}))
     versions = tuple(
-        f"{kind} of {take}: {_count(number)}"
+        f"{kind} of {take}: {number or 'no complete'} version{'' if number == 1 else 's'}"
         for (kind, take), number in holdings.takes.items()
     )
     users = tuple(
@@ -373,9 +373,3 @@ def write_erasure_report(withdrawal: Withdrawal, path: Path) -> Path:
 def _is_erased(db: Database, subject: str) -> bool:
     """Whether a subject was withdrawn, and nothing of any withdrawn subject is left."""
     return db.markers().is_withdrawn(subject) and not db.has_remains()
-
-
-def _count(number: int) -> str:
-    if not number:
-        return "no complete version"
-    return f"{number} version{'' if number == 1 else 's'}"

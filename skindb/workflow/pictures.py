@@ -451,7 +451,9 @@ def _faces(
         db.require_consent(take, "export")
         require_fresh(db, "model", take)
         unedited, moved = _moved(db, take, model, traits, study, dictionary)
-        attributes = _attributes(db, take, model)
+        attributes = {name: model.attrs[name] for name in SHOWN if name in model.attrs}
+        if db.has("capture", take):
+            attributes |= db.record("capture", take).provenance.get("traits", {})
         yield (
             face_record(
                 unedited,
@@ -507,13 +509,3 @@ def _moved(
         full, half = (source.move({name: part * amount}) for part in (1.0, 0.5))
         moved.append(Trait(name, full, half, amount))
     return plain, tuple(moved)
-
-
-def _attributes(db: Database, take: str, model: DataTree) -> Json:
-    attributes = {name: model.attrs[name] for name in SHOWN if name in model.attrs}
-    traits = (
-        db.record("capture", take).provenance.get("traits", {})
-        if db.has("capture", take)
-        else {}
-    )
-    return attributes | (dict(traits) if isinstance(traits, dict) else {})

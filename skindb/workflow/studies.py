@@ -335,7 +335,12 @@ def study(
         For another study or other parameters, without takes that consent to statistics,
         or if they were fitted with different parameters and none is named.
     """
-    record = _record(what)
+    if what not in STUDIES:
+        cure = f"choose from {', '.join(STUDIES)}"
+        raise input_error(
+            f"study {what}", "must be a known study", "another name", cure
+        )
+    record = STUDIES[what]
     chosen = _parameters(record, parameters)
     requested = _requested(chosen) | {"takes": [*takes], "release": release or ""}
     key = study_key(record, requested, name)
@@ -443,17 +448,6 @@ def study_function(record: Study) -> Callable[..., DataTree]:
 
 
 STUDY_FUNCTIONS = {name: study_function(record) for name, record in STUDIES.items()}
-
-
-def _record(what: str) -> Study:
-    if what not in STUDIES:
-        raise input_error(
-            f"study {what}",
-            "must be a known study",
-            "another name",
-            f"choose from {', '.join(STUDIES)}",
-        )
-    return STUDIES[what]
 
 
 def _parameters(record: Study, options: Attributes) -> Any:

@@ -133,8 +133,14 @@ class LocalProcesses:
         pool = self._pool()
         try:
             while waiting or running:
-                is_broken = not self._submit(pool, call, waiting, running)
-                for future in _next_done(running):
+                is_broken = False
+                try:
+                    while waiting and len(running) < self.workers:
+                        running[pool.submit(call, waiting[0])] = waiting[0]
+                        waiting.popleft()
+                except BrokenProcessPool:  # while the caller was busy with an outcome
+                    is_broken = True
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
                     outcome = _received(future, running.pop(future), function)
                     is_broken |= isinstance(outcome.error, KilledError)
                     yield outcome
@@ -153,28 +159,6 @@ class LocalProcesses:
             self.workers, timeout=IDLE_SECONDS, env=LOKY, **start
         )
         return pool
-
-    def _submit(
-        self,
-        pool: Pool,
-        call: Callable[[Take], bytes],
-        waiting: deque[Take],
-        running: dict[Future[bytes], Take],
-    ) -> bool:
-        """Give every idle process a take; False if a process died while the caller was
-        busy with an outcome.
-        """
-        try:
-            while waiting and len(running) < self.workers:
-                running[pool.submit(call, waiting[0])] = waiting[0]
-                waiting.popleft()
-        except BrokenProcessPool:
-            return False
-        return True
-
-
-def _next_done(running: dict[Future[bytes], Take]) -> set[Future[bytes]]:
-    return wait(running, return_when=FIRST_COMPLETED).done if running else set()
 
 
 def _received(
@@ -597,7 +581,11 @@ def map_takes(
     """
     takes = list(takes)
     function = as_part(function)
-    executor = _executor(min(workers or 1, len(takes)), client, shared)
+    executor: ThisProcess | LocalProcesses | Cluster = ThisProcess()
+    if client is not None:
+        executor = Cluster(client, shared)
+    elif (processes := min(workers or 1, len(takes))) > 1:
+        executor = LocalProcesses(processes)
     suspects = []
     with closing(executor.outcomes(function, takes)) as outcomes:
         for outcome in outcomes:
@@ -609,14 +597,6 @@ def map_takes(
         with closing(executor.outcomes(function, [take])) as outcomes:
             for outcome in outcomes:
                 yield replace(outcome, attempts=2)
-
-
-def _executor(
-    workers: int, client: Client | None, shared: Path | None
-) -> ThisProcess | LocalProcesses | Cluster:
-    if client is not None:
-        return Cluster(client, shared)
-    return LocalProcesses(workers) if workers > 1 else ThisProcess()
 
 
 def results_of(outcomes: Iterable[Outcome[Take, Result]]) -> Iterator[Result]:

@@ -19,7 +19,7 @@ from skindb.store import Database, UnavailableError, audit
 from skindb.store.audit import BLOCK, append_entry, entry_key, read_audit
 from skindb.store.bucket import Bucket
 from skindb.store.folder import Folder
-from skindb.store.markers import keyed_seal, require_secret, subject_hash
+from skindb.store.markers import keyed_hash, keyed_seal, require_secret
 
 WRITER = """
 import sys
@@ -56,7 +56,11 @@ def _sealed_again(db, number, **changes):
 def test_append_entry__states_who_what_and_whose(db):
     first, second, *_ = db.audit()[0]
     assert (first.number, first.actor, first.action) == (1, "anna", "export")
-    assert first.subjects == second.subjects == [subject_hash(Folder(db.root), "S01")]
+    assert (
+        first.subjects
+        == second.subjects
+        == [keyed_hash(require_secret(Folder(db.root)), "S01")]
+    )
     assert (first.counts, first.parameters) == ({"takes": 1}, {"generation": 1})
     assert (first.previous, second.previous) == ("", first.seal)
     assert first.when.endswith("+00:00")

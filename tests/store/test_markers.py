@@ -19,12 +19,12 @@ from skindb.errors import InputError
 from skindb.store import Database, MarkerFileWarning, markers
 from skindb.store.folder import Folder
 from skindb.store.markers import (
+    keyed_hash,
     mark_withdrawn,
     read_marker_file,
     read_markers,
     read_withdrawal,
     require_secret,
-    subject_hash,
 )
 
 WITHDRAWN_AT = datetime(2026, 3, 10, 12, tzinfo=UTC)
@@ -51,12 +51,12 @@ def test_subject_hash__depends_on_the_secret_and_the_whole_pseudonym(tmp_path):
     one = Folder(tmp_path / "one")
     other = Folder(tmp_path / "other")
     hashes = [
-        subject_hash(place, name)
+        keyed_hash(require_secret(place), name)
         for place in (one, other)
         for name in ("S01", "S0", "1")
     ]
     assert len(set(hashes)) == 6
-    assert subject_hash(one, "S01") == hashes[0]
+    assert keyed_hash(require_secret(one), "S01") == hashes[0]
     assert all(len(text) == 64 for text in hashes)
 
 
@@ -64,7 +64,8 @@ def test_secret__is_created_once_by_racing_writers(tmp_path):
     with ThreadPoolExecutor(8) as threads:
         hashes = list(
             threads.map(
-                lambda _: subject_hash(Folder(tmp_path / "db"), "S01"), range(32)
+                lambda _: keyed_hash(require_secret(Folder(tmp_path / "db")), "S01"),
+                range(32),
             )
         )
     assert len(set(hashes)) == 1
@@ -130,7 +131,7 @@ def test_verify__names_damaged_entries(place):
     db = Database(place.root)
     assert db.verify() == []
     first, second = (
-        place.root / f"withdrawn/{subject_hash(place, subject)}.json"
+        place.root / f"withdrawn/{keyed_hash(require_secret(place), subject)}.json"
         for subject in ("S01", "S02")
     )
     content = second.read_text()
