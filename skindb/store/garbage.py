@@ -9,7 +9,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import cache, partial
 
-from skindb.errors import InputError, input_error
+from skindb.errors import InputError, require
 from skindb.limits import RESUMABLE_SECONDS
 from skindb.schema.consent import CONSENT
 from skindb.store.erasure import SCRATCH_NAME, erase_withdrawn, holdings_of
@@ -138,13 +138,8 @@ def _unrecorded(place: Place, kind: str, take: str, now: Clock) -> Iterator[Garb
     for record in (one for one in records if log.is_removed(one.seal)):
         description = f"generation {record.generation}, whose removal was interrupted"
         reason = _in_use_reason(place, kind, take)
-        yield Garbage(
-            f"{log.key}/{record.generation:08d}.json",
-            description,
-            record.bytes,
-            reason,
-            record.generation,
-        )
+        number = record.generation
+        yield Garbage(log.record_key(number), description, record.bytes, reason, number)
     named = {record.path for record in records}
     stems = {match[1] for name in names if (match := VERSION_FILE.fullmatch(name))}
     stems = {stem for stem in stems if f"{key}/{stem}.zarr" not in named}
@@ -163,15 +158,10 @@ def _unrecorded(place: Place, kind: str, take: str, now: Clock) -> Iterator[Garb
             reason = ""  # its writer can no longer commit
         else:
             files = [f"{key}/{name}" for name in names if stem in name]
-            reason = _in_use_reason(place, kind, take) or _recent_reason(
-                place, files, now
-            )
-        yield Garbage(
-            f"{key}/{stem}.zarr",
-            "a version without a record, left by a killed run",
-            size,
-            reason,
-        )
+            in_use = _in_use_reason(place, kind, take)
+            reason = in_use or _recent_reason(place, files, now)
+        what = "a version without a record, left by a killed run"
+        yield Garbage(f"{key}/{stem}.zarr", what, size, reason)
 
 
 def _in_use_reason(place: Place, kind: str, take: str) -> str:
@@ -254,13 +244,10 @@ def _scratch_folders(place: Place, now: Clock) -> Iterator[Garbage]:
 
 def _old_generations(place: Place, generations: int, now: Clock) -> Iterator[Garbage]:
     """Generations that are neither among the newest ones nor inputs of a version that is kept."""
-    if generations < 1:
-        raise input_error(
-            "generations",
-            "must be at least 1, because the newest generation is kept",
-            str(generations),
-            "choose a larger number",
-        )
+    rule = "must be at least 1, because the newest generation is kept"
+    require(
+        generations >= 1, "generations", rule, str(generations), "choose a larger one"
+    )
     listed: dict[Key, Record] = {}
     waiting: list[Record] = []
     for log in committed_logs(place):
@@ -277,16 +264,8 @@ def _old_generations(place: Place, generations: int, now: Clock) -> Iterator[Gar
             waiting += [listed[key] for key in record.input_keys if key in listed]
     for (kind, take, generation), record in listed.items():
         if (kind, take, generation) not in stays:
-            description = (
-                f"generation {generation}, which is not an input of a kept version"
-            )
-            reason = _in_use_reason(place, kind, take) or _recent_reason(
-                place, [record.path], now
-            )
-            yield Garbage(
-                f"log/{kind}/{take}/{generation:08d}.json",
-                description,
-                record.bytes,
-                reason,
-                generation,
-            )
+            what = f"generation {generation}, which is not an input of a kept version"
+            in_use = _in_use_reason(place, kind, take)
+            reason = in_use or _recent_reason(place, [record.path], now)
+            key = Log(place, kind, take).record_key(generation)
+            yield Garbage(key, what, record.bytes, reason, generation)

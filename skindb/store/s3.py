@@ -228,13 +228,9 @@ def _unavailable(location: str, text: str) -> UnavailableError:
     if "/latest/" in text and not code:  # the metadata service of a virtual machine
         return _fault(location, "credentials must be set", "none", CURE_NO_KEYS)
     if code in (401, 403) or "AccessDenied" in text:
+        rule = "the credentials must permit this request"
         return DeniedError(
-            Fault(
-                location,
-                "the credentials must permit this request",
-                phrase or "access denied",
-                CURE_PERMISSION,
-            )
+            Fault(location, rule, phrase or "access denied", CURE_PERMISSION)
         )
     if 300 <= code < 400:
         return _fault(

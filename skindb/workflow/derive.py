@@ -36,6 +36,11 @@ NOT_FOLLOWED = ("skindb.store.", "skindb.schema.variables.")
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 # fields of syntax trees that follow from others or do not change what is computed
 DERIVED_FIELDS = ("ctx", "kind", "type_comment", "type_params")
+ANNOTATIONS: dict[type[ast.AST], str] = {
+    ast.FunctionDef: "returns",
+    ast.AsyncFunctionDef: "returns",
+    ast.arg: "annotation",
+}
 
 Symbol = tuple[str, str]  # module and name
 Reference = tuple[str, tuple[str, ...]]  # module and dotted names
@@ -253,19 +258,13 @@ def _written(node: Any) -> Any:
     if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "option":
         # a parameter of `skindb.parameters`, whose help does not count
         return _written([*node.args[:1], *node.keywords])
-    skipped = {*DERIVED_FIELDS, *_annotations(node)}
+    skipped = {*DERIVED_FIELDS, ANNOTATIONS.get(type(node))}
     fields = tuple(
         (name, _written(value))
         for name, value in ast.iter_fields(node)
         if name not in skipped and value not in (None, [])
     )
     return type(node).__name__, fields
-
-
-def _annotations(node: ast.AST) -> tuple[str, ...]:
-    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-        return ("returns",)
-    return ("annotation",) if isinstance(node, ast.arg) else ()
 
 
 @cache

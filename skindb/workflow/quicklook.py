@@ -94,7 +94,11 @@ def quick(
     fit = FitParameters(eta=known.pop("eta"))
     points = known.pop("points")
     consent = {"scope": ["fit", "export"], "reference": "quick, nothing is stored"}
-    _remove_left()
+    # folders of killed runs, with their copies of photographs
+    for left in Path(tempfile.gettempdir()).glob(f"{PREFIX}*"):
+        holder = read_json(left / PROCESS, [])
+        if isinstance(holder, dict) and has_ended(holder):
+            shutil.rmtree(left, ignore_errors=True)
     with (
         private_umask(),
         tempfile.TemporaryDirectory(prefix=PREFIX) as folder,
@@ -141,14 +145,6 @@ def _naming(source: str | Path, folder: str) -> Iterator[None]:
             else fault
             for fault in error.faults
         ) from None
-
-
-def _remove_left() -> None:
-    """Remove the folders of killed runs, with their copies of photographs."""
-    for folder in Path(tempfile.gettempdir()).glob(f"{PREFIX}*"):
-        holder = read_json(folder / PROCESS, [])
-        if isinstance(holder, dict) and has_ended(holder):
-            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _write_maps(model: DataTree, out: Path, step: int) -> Json:

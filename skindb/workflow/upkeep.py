@@ -137,8 +137,13 @@ def _repeat(db: Database, dictionary: Path | None, request: Request) -> Record:
         return _repeat_registration(db, request)
     if request.kind == RELEASE:
         return _repeat_release(db, request)
-    repeat = repeat_study if request.kind == STUDY else repeat_edit
-    return repeat(db, request.take, request.parameters, dictionary=dictionary)
+    if request.kind == STUDY:
+        return repeat_study(db, request.take, request.parameters, dictionary=dictionary)
+    # by the same amounts, with the newest study of that name
+    amounts = request.parameters["amounts"]
+    study = request.parameters.get("study", "traits")
+    tree = edit(db, request.take, amounts, study=study, dictionary=dictionary)
+    return db.record("edit", request.take, tree.attrs["generation"])
 
 
 def repeat_study(
@@ -185,19 +190,6 @@ def repeat_study(
     return db.record(STUDY, key, results.attrs["generation"])
 
 
-def repeat_edit(
-    db: Database,
-    take: str,
-    parameters: Attributes,
-    *,
-    dictionary: Path | None = None,
-) -> Record:
-    """Edit a model again by the same amounts, with the newest study of that name."""
-    study = parameters.get("study", "traits")
-    tree = edit(db, take, parameters["amounts"], study=study, dictionary=dictionary)
-    return db.record("edit", take, tree.attrs["generation"])
-
-
 def _repeat_registration(db: Database, request: Request) -> Record:
     """All takes together: the common (u, v) depends on each of them."""
     reference = request.parameters.get("reference") or None
@@ -221,13 +213,10 @@ def _repeat_release(db: Database, request: Request) -> Record:
     )
     registrations = []
     for take in request.parameters.get("takes", []):
-        record = (
-            db.record("registration", take) if db.has("registration", take) else None
-        )
-        if record is not None and models.get(take) in {
-            pin.get("seal") for pin in record.made_from
-        }:
-            registrations.append(record.as_input())
+        if db.has("registration", take):
+            record = db.record("registration", take)
+            if models.get(take) in {pin["seal"] for pin in record.made_from}:
+                registrations.append(record.as_input())
     if not registrations and "pins" not in request.parameters:
         return db.record(RELEASE, request.take)
     return db.commit_release(request.take, [*pins, *registrations])
@@ -245,13 +234,8 @@ def _fit_again(
     results = []
     for outcome in map_takes(call, list(stale_models), **resources, shared=db.folder):
         record = outcome.value if isinstance(outcome.value, Record) else None
-        results.append(
-            replace(
-                stale_models[outcome.take],
-                record=record,
-                fault=str(outcome.error or ""),
-            )
-        )
+        fault = str(outcome.error or "")
+        results.append(replace(stale_models[outcome.take], record=record, fault=fault))
     return results
 
 
@@ -261,19 +245,16 @@ def _register_again(
     """All takes together: the common (u, v) depends on each of them."""
     registration = db.record("registration", stale[0].take)
     reference = registration.provenance.get("parameters", {}).get("reference") or None
+    fault = "its consent does not cover statistics, or its model has no landmarks"
+    records: dict[str, Record] = {}
     try:
         records = register_takes(db, reference=reference, **resources)
     except UnavailableError:
         raise
     except InputError as error:
-        return [replace(result, fault=str(error)) for result in stale]
-    rule = "its consent does not cover statistics, or its model has no landmarks"
-    return [
-        replace(result, record=records[result.take])
-        if result.take in records
-        else replace(result, fault=rule)
-        for result in stale
-    ]
+        fault = str(error)
+    made = [replace(result, record=records.get(result.take)) for result in stale]
+    return [one if one.record else replace(one, fault=fault) for one in made]
 
 
 def _repeat_again(
