@@ -197,11 +197,6 @@ def _calibration_lines(record: Record, report: Json) -> list[str]:
         lines.append(
             f"  gains of {report['probe']['fibres']} fibres: known to {gains:.2%} or better"
         )
-    if "largest_change" in report:
-        lines.append(
-            f"  largest change since {record.generation - 1}: "
-            f"{report['largest_change']:.2%}, {report['most_changed']}"
-        )
     return lines
 
 

@@ -291,9 +291,4 @@ def asked(name: str) -> Any:
 
 def progress_style() -> str:
     """How the running command shows its progress: bar, json or none."""
-    style = asked("progress")
-    if asked("no_progress") and style not in (None, "none"):
-        raise click.UsageError(
-            f"--no-progress and --progress {style} contradict each other; give only one of them"
-        )
-    return "none" if asked("no_progress") else style or "bar"
+    return "none" if asked("no_progress") else asked("progress") or "bar"

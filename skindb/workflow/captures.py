@@ -434,7 +434,7 @@ def calibrated_capture(db: Database, capture: Capture) -> Capture:
         )
     record = db.record(CALIBRATION, name)
     stored = db.read(CALIBRATION, name, generation=record.generation)
-    groups = {group: child.to_dataset() for group, child in stored.children.items()}
+    groups = groups_of(stored)
     source = f"calibration {name}"
     for group, apply in APPLIED.items():
         if dome is not None and group in groups:
@@ -445,16 +445,10 @@ def calibrated_capture(db: Database, capture: Capture) -> Capture:
 
 
 def describe_calibration(db: Database, record: Record) -> Json:
-    """Largest relative errors of intensities, change since the version before, cameras,
-    takes of earlier versions.
-    """
-    groups = _groups(db, record, record.generation)
+    """Largest relative errors of intensities, cameras, takes of earlier versions."""
+    version = db.read(CALIBRATION, record.take, generation=record.generation)
+    groups = groups_of(version.load())
     description = _describe_lights(groups["light_calibration"])
-    if record.generation > 1:
-        before = _groups(db, record, record.generation - 1)
-        description |= _largest_change(
-            groups["light_calibration"], before["light_calibration"]
-        )
     if (positions := groups.get("position_calibration")) is not None:
         errors = positions[variables.CALIBRATED_POSITION_ERROR]
         description["largest_position_error_mm"] = float(errors.max())
@@ -486,24 +480,6 @@ def _describe_lights(lights: Dataset) -> Json:
         "glare": float(glare.median()),
         "total_relative_error": float(total.max()),
     }
-
-
-def _largest_change(lights: Dataset, before: Dataset) -> Json:
-    """Largest change of the intensity of a light that two versions have."""
-    name = variables.CALIBRATED_INTENSITY
-    change = abs(lights[name] / before[name] - 1).max(dim="channel")
-    if not change.size:
-        return {}
-    return {
-        "largest_change": float(change.max()),
-        "most_changed": str(change["light"].values[change.values.argmax()]),
-    }
-
-
-def _groups(db: Database, record: Record, generation: int) -> dict[str, Dataset]:
-    """The groups of a version of a calibration, in memory."""
-    stored = db.read(CALIBRATION, record.take, generation=generation)
-    return {name: group.to_dataset().load() for name, group in stored.children.items()}
 
 
 def _describe_cameras(calibration: Dataset) -> Json:
