@@ -23,7 +23,7 @@ from skindb.virtual.person import default_people
 
 HELD_OUT = 0.1  # fraction of the lights
 SPACING = 1.5  # mm
-MAP_TEXELS = 1024  # along each side of an exported map
+MAP_TEXELS = 512  # along each side of an exported map: 1 mm, of surfels 1.5 mm apart
 MAX_WORKERS = 4  # each take of the demo needs 1.5 GB
 # 0 and 1 correspond to measured takes of one subject
 EDIT_CONDITION = "lotion"
