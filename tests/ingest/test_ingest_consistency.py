@@ -559,15 +559,36 @@ def test_ingest_capture__judges_and_samples_views_by_decoding_them_once(
     assert len(decoded) == LIGHTS * CAMERAS
 
 
+def _ingested(capture, scratch, progress=None, **parameters):
+    chosen = IngestParameters(spacing_mm=8.0, **parameters)
+    options = {} if progress is None else {"progress": progress}
+    with ingest_capture(capture, chosen, scratch=scratch, **options) as tree:
+        return tree.load()
+
+
+@pytest.fixture(scope="module")
+def misplaced(shoot):
+    """The capture with cameras that are not where its calibration says."""
+    capture = read_capture(shoot.folder)
+    return replace(capture, dome=_misplaced(capture.dome))
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(misplaced, tmp_path_factory):
+    """Captures of misplaced cameras, refined and as they are."""
+    folder = tmp_path_factory.mktemp("uninterrupted")
+    return [
+        _ingested(misplaced, folder / str(refine), refine=refine)
+        for refine in ("auto", False)
+    ]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("views", [5, LIGHTS * CAMERAS])
 def test_ingest_capture__interrupted_with_rotated_cameras_has_the_same_samples(
-    shoot, tmp_path, views
+    misplaced, uninterrupted, tmp_path, views
 ):
     """Samples taken before the cameras are rotated are never mixed with later ones."""
-    capture = read_capture(shoot.folder)
-    capture = replace(capture, dome=_misplaced(capture.dome))
-    parameters = IngestParameters(spacing_mm=8.0)
     stages = []
 
     def interrupt(stage, step, _):
@@ -575,24 +596,16 @@ def test_ingest_capture__interrupted_with_rotated_cameras_has_the_same_samples(
         if (stage, step) == ("sample", views) and (views == 5 or "refine" in stages):
             raise KeyboardInterrupt
 
-    with (
-        pytest.raises(KeyboardInterrupt),
-        ingest_capture(capture, parameters, scratch=tmp_path, progress=interrupt),
-    ):
-        pass
-    results = []
-    for refine, folder in (("auto", "."), ("auto", "whole"), (False, "as it is")):
-        with ingest_capture(
-            capture, replace(parameters, refine=refine), scratch=tmp_path / folder
-        ) as tree:
-            results.append(tree.load())
-    resumed, whole, misplaced = results
+    with pytest.raises(KeyboardInterrupt):
+        _ingested(misplaced, tmp_path, interrupt)
+    resumed = _ingested(misplaced, tmp_path)
+    whole, unrefined = uninterrupted
     assert whole.attrs["summary"] == resumed.attrs["summary"]
     assert whole.attrs["summary"]["corrections"]["refine"].startswith("on,")
     for group in ("samples", "calibration", "dome", "photographs"):
         assert whole[group].to_dataset().identical(resumed[group].to_dataset())
     before, after = (
-        tree["samples/reflectance_sample"].values for tree in (misplaced, whole)
+        tree["samples/reflectance_sample"].values for tree in (unrefined, whole)
     )
     seen = np.isfinite(after).any(axis=(0, 3))
     same = np.isclose(before, after, equal_nan=True).all(axis=(0, 3))
@@ -617,15 +630,21 @@ def _damaged(file):
         write(content[60:200])
 
 
+@pytest.fixture(scope="module")
+def refined(shoot, tmp_path_factory):
+    """The capture, whose cameras were refined."""
+    folder = tmp_path_factory.mktemp("refined")
+    return _ingested(read_capture(shoot.folder), folder, refine=True)
+
+
 @pytest.mark.parametrize("part", ["contact", "dome/white"])
 def test_ingest_capture__repaired_is_refined_and_checked_like_any_other(
-    shoot, tmp_path, part
+    shoot, refined, tmp_path, part
 ):
     """Frames of other things than the face were damaged, also after an interruption: the
     run that resumes has the same samples and calibration as if nothing had happened.
     """
     capture = read_capture(shoot.folder)
-    parameters = IngestParameters(spacing_mm=8.0, refine=True)
     stages = []
 
     def interrupt(stage, step, _):
@@ -634,10 +653,7 @@ def test_ingest_capture__repaired_is_refined_and_checked_like_any_other(
             raise KeyboardInterrupt
 
     def ingested(name, progress=None):
-        with ingest_capture(
-            capture, parameters, scratch=tmp_path / name, progress=progress
-        ) as tree:
-            return tree.load()
+        return _ingested(capture, tmp_path / name, progress, refine=True)
 
     with pytest.raises(KeyboardInterrupt):
         ingested("interrupted", interrupt)
@@ -646,12 +662,11 @@ def test_ingest_capture__repaired_is_refined_and_checked_like_any_other(
         for name in ("interrupted", "new"):
             with pytest.raises(InputError, match=frame.name):
                 ingested(name)
-    whole = ingested("whole")
-    assert np.isfinite(whole["calibration/camera_agreement"]).all()
+    assert np.isfinite(refined["calibration/camera_agreement"]).all()
     for name in ("interrupted", "new"):
         repaired = ingested(name)
         for group in ("samples", "calibration", "dome", "photographs", "probe"):
-            assert whole[group].to_dataset().identical(repaired[group].to_dataset())
+            assert refined[group].to_dataset().identical(repaired[group].to_dataset())
 
 
 def test_camera_offset__finds_a_planted_move_of_a_smooth_picture():
