@@ -256,9 +256,13 @@ class Database:
         else:
             snapshot = Snapshot(self.place)
             record = pinned_record(snapshot, pins_of(snapshot, release), kind, take)
+        return self.version(record, groups)
+
+    def version(self, record: Record, groups: Sequence[str] | None = None) -> DataTree:
+        """The version of a record, see `read`."""
         version = open_version(self.place, record, groups)
-        if kind not in INFO_SECTIONS:
-            version.attrs |= self._consent_of(take)
+        if record.kind not in INFO_SECTIONS:
+            version.attrs |= self._consent_of(record.take)
         return version
 
     def _consent_of(self, take: str) -> dict[Any, Any]:
@@ -463,12 +467,7 @@ class Database:
                     "a different version of that generation",
                     "compute the version again",
                 )
-                return self.read(
-                    kind,
-                    made_from["take"],
-                    generation=made_from["generation"],
-                    groups=groups,
-                )
+                return self.version(record, groups)
         raise input_error(
             title,
             f"its provenance must name a {kind}",

@@ -433,7 +433,7 @@ def calibrated_capture(db: Database, capture: Capture) -> Capture:
             "run skindb calibrate first",
         )
     record = db.record(CALIBRATION, name)
-    stored = db.read(CALIBRATION, name, generation=record.generation)
+    stored = db.version(record)
     groups = groups_of(stored)
     source = f"calibration {name}"
     for group, apply in APPLIED.items():
@@ -446,8 +446,7 @@ def calibrated_capture(db: Database, capture: Capture) -> Capture:
 
 def describe_calibration(db: Database, record: Record) -> Json:
     """Largest relative errors of intensities, cameras, takes of earlier versions."""
-    version = db.read(CALIBRATION, record.take, generation=record.generation)
-    groups = groups_of(version.load())
+    groups = groups_of(db.version(record).load())
     description = _describe_lights(groups["light_calibration"])
     if (positions := groups.get("position_calibration")) is not None:
         errors = positions[variables.CALIBRATED_POSITION_ERROR]

@@ -184,7 +184,7 @@ def registered_parts(
 
 
 def _summarise_model(db: Database, record: Record) -> Record:
-    model = db.read("model", record.take, generation=record.generation)
+    model = db.version(record)
     groups = sample_groups(model) | {TABLES: tables_of(model)}
     return _commit_summary(db, record, groups, summary_parameters())
 
@@ -204,12 +204,7 @@ def _map(db: Database, request: CohortRequest, record: Record) -> Record:
 
 def _registered_model(db: Database, record: Record) -> tuple[DataTree, Dataset]:
     """The model of a registration, and the group "registration"."""
-    version = db.read(
-        "registration",
-        record.take,
-        generation=record.generation,
-        groups=["registration"],
-    )
+    version = db.version(record, ["registration"])
     model = db.source(version, "model", record.take, SURFACE)
     return model, version["registration"].to_dataset()
 
@@ -373,9 +368,7 @@ def registered_datasets(
     """The group "registration" of versions; what belongs to no surfel is in memory."""
     out = {}
     for take, record in records.items():
-        version = db.read(
-            "registration", take, generation=record.generation, groups=["registration"]
-        )
+        version = db.version(record, ["registration"])
         ds = version["registration"].to_dataset()
         small = {name: ds[name].load() for name in ds if "surfel" not in ds[name].dims}
         out[take] = ds.assign(small)
@@ -408,8 +401,7 @@ def _has_landmarks(db: Database, record: Record) -> bool:
     mesh = record.contents.get("mesh", {"variables": []})
     if variables.LANDMARK_POSITION not in mesh["variables"]:
         return False
-    model = db.read("model", record.take, generation=record.generation, groups=["mesh"])
-    return has_landmarks(model)
+    return has_landmarks(db.version(record, ["mesh"]))
 
 
 # functions that compute what cohorts need

@@ -88,7 +88,7 @@ def edit(
     """
     source = editable_model(db, take, study, dictionary)
     record = derive(source.derivation_by(amounts), partial(source.move, amounts))
-    return db.read("edit", take, generation=record.generation)
+    return db.version(record)
 
 
 @logged("render")
@@ -250,14 +250,12 @@ def editable_model(
 ) -> Editable:
     """A model of a database with what moves it along the traits of a study."""
     study = _trait_study(db, study)
-    model = db.read("model", take)
-    vectors = db.read(STUDY, study)
+    inputs = [db.record("model", take), db.record(STUDY, study)]
+    model, vectors = map(db.version, inputs)
     db.require_consent(take, "statistics")
     require_fresh(db, STUDY, study)
     require_mixture(model["fitted"].to_dataset(), f"model of {take}")
     brdfs = [str(name) for name in model["fitted"].to_dataset()["dictionary"].values]
-    study_record = db.record(STUDY, study, vectors.attrs["generation"])
-    inputs = [db.record("model", take, model.attrs["generation"]), study_record]
     textures, registrations = _registered_textures(db, take, model, vectors)
     inputs += registrations
     traits, basis, albedo = (

@@ -73,11 +73,11 @@ def fit_take(
         db.lease(take, "model", wait=wait, command="skindb fit") as lease,
         one_blas_thread(),
     ):
-        capture = db.read("capture", take, generation=generation)
+        record = db.record("capture", take, generation)
+        capture = db.version(record)
         # the newest record decides
         db.require_consent(take, "fit")
-        read = db.record("capture", take, capture.attrs["generation"])
-        derivation = fit_derivation(db, read, requested, dictionary)
+        derivation = fit_derivation(db, record, requested, dictionary)
         name = f"{take}-{seal_of(derivation.provenance)[:16]}"
         scratch = db.scratch() / name
         _remove_first_passes(db, take, besides=name)

@@ -87,14 +87,14 @@ def calibrate_rig(
     positions = dict[str, Float64]()
     for number, (take, model) in enumerate(models.items()):
         progress("lights", number, len(models))
-        capture = db.read("capture", take)
-        record = db.record("capture", take, capture.attrs["generation"])
+        record = db.record("capture", take)
+        capture = db.version(record)
         lights = _lights(record, capture)
         positions = positions or lights
         _require_rig(positions, lights, take=take, first=next(iter(models)))
         positions = lights | positions
         rng = np.random.default_rng([seed, number])
-        fitted = db.read("model", take, generation=model.generation)
+        fitted = db.version(model)
         own, camera_gains = take_residuals(capture, fitted, rng=rng)
         residuals.append((own, lights))
         cameras.append(camera_gains)
@@ -130,7 +130,7 @@ def describe_rig(db: Database, record: Record) -> dict[str, Any]:
     """Gains and directions of the lights and gains of the cameras of a calibration from
     takes: their spread, errors, and the spread that they leave in a held-out take.
     """
-    stored = db.read(CALIBRATION, record.take, generation=record.generation)
+    stored = db.version(record)
     rig = stored[RIG].to_dataset().load()
     count = rig[variables.RIG_TAKES].values
     few = rig["light"].values[count < MIN_TAKES]

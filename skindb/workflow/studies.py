@@ -342,7 +342,10 @@ def study(
         )
     record = STUDIES[what]
     chosen = _parameters(record, parameters)
-    requested = _requested(chosen) | {"takes": [*takes], "release": release or ""}
+    # what another run needs to repeat the study
+    requested = {name: _plain(value) for name, value in asdict(chosen).items()}
+    requested.pop("dictionary", None)
+    requested |= {"takes": [*takes], "release": release or ""}
     key = study_key(record, requested, name)
     dictionary = parameters.get("dictionary")
     studied = takes or db.takes("model", release=release)
@@ -422,15 +425,9 @@ def study_function(record: Study) -> Callable[..., DataTree]:
         return study(db, record.name, **options)
 
     general = inspect.signature(study).parameters
-    unset = inspect.Parameter.empty
     keywords = [
-        inspect.Parameter(
-            spec.name,
-            inspect.Parameter.KEYWORD_ONLY,
-            default=unset if spec.default is MISSING else spec.default,
-            annotation=spec.type,
-        )
-        for spec in fields(record.parameters)
+        parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+        for parameter in inspect.signature(record.parameters).parameters.values()
     ]
     keywords += [general[name] for name in ("takes", "release", "name")]
     function.__signature__ = inspect.Signature([general["db"], *keywords])  # type: ignore[attr-defined]
@@ -473,13 +470,6 @@ def _parameters(record: Study, options: Attributes) -> Any:
     parameters = record.parameters(**chosen)
     require_limits(parameters)
     return parameters
-
-
-def _requested(parameters: Any) -> dict[str, Any]:
-    """What another run needs to repeat a study with these parameters."""
-    values = asdict(parameters)
-    values.pop("dictionary", None)
-    return {name: _plain(value) for name, value in values.items()}
 
 
 def _plain(value: Any) -> Any:
