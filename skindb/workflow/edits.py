@@ -191,7 +191,7 @@ def basis_grid(
     model = db.read("model", take)
     db.require_consent(take, "export")
     require_mixture(model["fitted"].to_dataset(), f"model of {take}")
-    names = [str(name) for name in model["fitted"].to_dataset()["dictionary"].values]
+    names = model["fitted"].to_dataset()["dictionary"].values.tolist()
     tables = studies.dictionary_tables(
         names, float(model[f"basis/{variables.DISC_ANGULAR_RADIUS}"]), dictionary
     )
@@ -255,7 +255,7 @@ def editable_model(
     db.require_consent(take, "statistics")
     require_fresh(db, STUDY, study)
     require_mixture(model["fitted"].to_dataset(), f"model of {take}")
-    brdfs = [str(name) for name in model["fitted"].to_dataset()["dictionary"].values]
+    brdfs = model["fitted"].to_dataset()["dictionary"].values.tolist()
     textures, registrations = _registered_textures(db, take, model, vectors)
     inputs += registrations
     traits, basis, albedo = (

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from xarray import DataTree
 
-from skindb.errors import InputError, input_error
+from skindb.errors import input_error
 from skindb.export.bundle import export_bundle
 from skindb.export.gltf import export_gltf
 from skindb.files import Json, make_private
@@ -269,14 +269,10 @@ def _diffusion_lengths(db: Database, site: str) -> dict[str, float]:
     lengths = {}
     for take in db.takes("model"):
         model = db.read("model", take)
-        try:
-            db.require_consent(take, "export")
-        except InputError:
-            continue
-        if "translucency" not in model.children:
+        if "export" not in db.consent(take) or "translucency" not in model.children:
             continue
         sites = model["translucency"].to_dataset()
-        if site in [str(name) for name in sites["site"].values]:
+        if site in sites["site"].values.tolist():
             sigma = sites[variables.SITE_SIGMA_TR].sel(site=site).values.astype(float)
             if (np.isfinite(sigma) & (sigma > 0)).all():
                 lengths[take] = float((1 / sigma).mean())
@@ -286,9 +282,8 @@ def _diffusion_lengths(db: Database, site: str) -> dict[str, float]:
 def _nose(model: DataTree) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Tip of the nose (3,), or the middle of the surfels."""
     mesh = model["mesh"].to_dataset()
-    if variables.LANDMARK_POSITION in mesh and LANDMARK in [
-        str(name) for name in mesh["landmark"].values
-    ]:
+    landmarks = mesh["landmark"].values.tolist() if "landmark" in mesh.coords else []
+    if variables.LANDMARK_POSITION in mesh and LANDMARK in landmarks:
         return float64(mesh[variables.LANDMARK_POSITION].sel(landmark=LANDMARK).values)
     return float64(
         model["fitted"].to_dataset()[variables.SURFEL_POSITION].values.mean(axis=0)
