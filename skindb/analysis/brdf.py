@@ -302,7 +302,7 @@ def surfel_errors(systems: Systems, bases: Sequence[Array]) -> Array:
     out = np.empty((len(systems.square), 2, len(bases) + 1))
     for j, basis in enumerate([*bases, None]):
         x, out[:, 0, j] = residuals(systems, basis)
-        out[:, 1, j] = np.maximum(systems.count - (x > 0).sum(axis=1), 0)
+        out[:, 1, j] = np.maximum(systems.samples - (x > 0).sum(axis=1), 0)
     return out
 
 

@@ -64,32 +64,18 @@ SMOOTH = 10.0  # mm; within this distance of a site its value hardly changes
 MIDLINE = 10.0  # mm; sites farther from the mid-plane represent both sides of the face
 TRUSTED = (*IDENTIFIED, ProbeStatus.NOT_CONVERGED)
 TABLE_HEADER = ("site", "channel", "sigma_tr [1/mm]", "total error", "noise", "status")
-FIELDS = {
-    "site_absorption": "sigma_a",
-    "site_reduced_scattering": "sigma_s_prime",
-    "site_sigma_tr": "sigma_tr",
-    "site_sigma_tr_error": "sigma_tr_error",
-    "site_sigma_tr_model_error": "sigma_tr_model_error",
-    "site_sigma_tr_total_error": "sigma_tr_total_error",
-    "site_gain": "gain",
-    "site_residual": "residual",
-    "site_misfit": "misfit",
-    "site_chi_squared": "chi_squared",
-    "site_fibres_used": "used",
-    "site_status": "status",
-}
 
 
 @dataclass(frozen=True)
 class ProbeFit:
     """Coefficients of one profile in mm^-1, with diagnostics of the fit; NaN where
-    nothing was fitted.
+    nothing was fitted. Names are those of variables, without "site_".
     """
 
-    used: int  # fibres
+    fibres_used: int
     status: ProbeStatus
-    sigma_a: float = math.nan
-    sigma_s_prime: float = math.nan
+    absorption: float = math.nan
+    reduced_scattering: float = math.nan
     sigma_tr: float = math.nan
     sigma_tr_error: float = math.nan  # standard error due to the measured errors
     # error due to the inaccuracy of the profile model
@@ -338,8 +324,8 @@ def _report(minimum: Any, problem: Problem, *, rival: float, near: float) -> Pro
     }
     broken = (verdict for verdict, applies in verdicts.items() if applies)
     return ProbeFit(
-        sigma_a=a,
-        sigma_s_prime=s,
+        absorption=a,
+        reduced_scattering=s,
         sigma_tr=tr,
         sigma_tr_error=tr * error,
         sigma_tr_model_error=tr * off,
@@ -348,7 +334,7 @@ def _report(minimum: Any, problem: Problem, *, rival: float, near: float) -> Pro
         residual=float(np.sqrt(np.mean(problem.misfit(p) ** 2))),
         misfit=unexplained,
         chi_squared=excess,
-        used=fibres,
+        fibres_used=fibres,
         status=next(broken, ProbeStatus.FITTED),
     )
 
@@ -437,8 +423,8 @@ def fit_probe(probe: xr.Dataset, *, eta: float = 1.3) -> xr.Dataset:
     ]
     shape = probe.sizes["site"], probe.sizes["channel"]
     columns = {
-        name: np.reshape([getattr(fit, field) for fit in fits], shape)
-        for name, field in FIELDS.items()
+        f"site_{name}": np.reshape([getattr(fit, name) for fit in fits], shape)
+        for name in ProbeFit.__dataclass_fields__
     }
     coords = {
         dim: probe[dim].values for dim in ("site", "channel") if dim in probe.coords

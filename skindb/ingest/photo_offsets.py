@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
+from scipy.stats import quantile
 
 from skindb.ingest._sample_kernels import (
     FLOOR,
@@ -229,22 +230,12 @@ def surfel_albedo(
             ratio /= max(float(np.nanmedian(ratio)), FLOOR)
     measured = np.isfinite(ratios).any(axis=0)
     albedo = np.ones(ratios.shape[1])
-    albedo[measured] = nan_quantile(ratios[:, measured], ALBEDO_QUANTILE)
+    # `np.nanquantile` makes a call for each column
+    albedo[measured] = quantile(
+        ratios[:, measured], ALBEDO_QUANTILE, axis=0, nan_policy="omit"
+    )
     middle = max(float(np.median(albedo[measured])), FLOOR)
     return np.clip(albedo / middle, *ALBEDO_RANGE)
-
-
-def nan_quantile(values: Float64, level: float) -> Float64:
-    """`np.nanquantile` along the first axis, which makes a call for each column."""
-    ordered = np.sort(values, axis=0)
-    place = level * ((~np.isnan(ordered)).sum(axis=0) - 1)
-    below = np.maximum(place.astype(int), 0)
-    above = np.ceil(np.maximum(place, 0)).astype(int)
-    low = np.take_along_axis(ordered, below[None], 0)[0]
-    high = np.take_along_axis(ordered, above[None], 0)[0]
-    part = place - below
-    step = high - low
-    return np.asarray(np.where(part < 0.5, low + step * part, high - step * (1 - part)))
 
 
 def square_root_image(image: Array) -> Float64:

@@ -278,27 +278,19 @@ def remove_stale(own: Path) -> None:
     Only for a folder that contains nothing but spools, such as the folder tmp of a database.
     """
     for folder in own.parent.iterdir() if own.parent.is_dir() else ():
-        if folder == own or not (
-            folder.name.endswith(REMOVED_SUFFIX)
-            or time.time() - _touched(folder) > STALE_SECONDS
-        ):
+        if folder == own:
             continue
         # in use, or removed by another process at this moment
         with suppress(InputError, OSError):
+            # also changed by each entry of the journal
+            age = time.time() - folder.stat().st_mtime
+            if age <= STALE_SECONDS and not folder.name.endswith(REMOVED_SUFFIX):
+                continue
             lock = _locked(folder, new=False)
             try:
                 _remove(folder)
             finally:
                 os.close(lock)
-
-
-def _touched(folder: Path) -> float:
-    """Time of the last change; infinity if the folder no longer exists."""
-    marks = []
-    for path in (folder, folder / JOURNAL):
-        with suppress(OSError):
-            marks.append(path.stat().st_mtime)
-    return max(marks, default=np.inf)
 
 
 def _remove(folder: Path) -> None:

@@ -55,19 +55,14 @@ def internal_diffuse_reflectance(eta: float) -> float:
     """F_dr, the cosine-weighted mean of F_r from inside, by quadrature (relative error
     below 1e-12).
     """
-    if eta <= 1.0:
-        inside = eta
-        low = 0.0
-    else:
-        inside = eta
-        low = float(np.sqrt(1.0 - 1.0 / eta**2))
+    low = float(np.sqrt(max(1.0 - 1.0 / eta**2, 0.0)))
     # below the critical cosine all light is reflected; above, c = low + (1 - low) t^2
     # removes the square-root kink
     x, w = np.polynomial.legendre.leggauss(200)
     t = (x + 1.0) / 2.0
     wt = w / 2.0
     c = low + (1.0 - low) * t**2
-    passed = fresnel_reflectance(c, 1.0 / inside) * 2.0 * c * 2.0 * (1.0 - low) * t
+    passed = fresnel_reflectance(c, 1.0 / eta) * 2.0 * c * 2.0 * (1.0 - low) * t
     return float(low**2 + (passed * wt).sum())
 
 

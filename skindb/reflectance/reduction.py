@@ -14,10 +14,9 @@ non-negative, by non-negative least squares on the normal equations of the surfe
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -215,7 +214,6 @@ def reduce_basis(
     dictionary: Dictionary,
     rng: np.random.Generator,
     k: int = 4,
-    in_metric: bool = False,
 ) -> xr.Dataset:
     """Basis of k mixtures of the dictionary's BRDFs for the surface reflectance of the surfels.
 
@@ -229,20 +227,13 @@ def reduce_basis(
         Selects the 5,000 surfels that are factorised, and initialises the factorisation.
     k
         Number of components, at most the number of fitted surfels and of BRDFs.
-    in_metric
-        Measure the error between BRDFs (`brdf_metric`) instead of coefficients (the
-        choice of the paper). On three virtual takes, linear refits had a residual above
-        that of the dictionary by 1.4, 2.9 and 5.4 % with k = 4 (coefficients: 3.2, 3.8
-        and 4.0 %), and by 0.5, 1.1 and 0.7 % with k = 8 (coefficients: 1.0, 1.8 and 2.5
-        %). Coefficients were better with k = 2 (two takes), the metric from k = 6; with
-        k = 4 it depends on the take.
 
     Returns
     -------
     Dataset
         `basis_mixture` (rows of H), `basis_brdf`, `mean_dictionary_weight` (area
         weighted) and `disc_angular_radius` [rad] of the dictionary. Attributes: error
-        and spread of the factorisation over its seeds, surfels used, metric.
+        and spread of the factorisation over its seeds, surfels used.
     """
     check(fitted, ("dictionary_weight", "fit_status", "surfel_area"), where="fitted")
     good = fitted_surfels(fitted, ("dictionary_weight",))
@@ -258,10 +249,9 @@ def reduce_basis(
         )
     count = min(MAX_SAMPLED_SURFELS, len(good))
     chosen = good[np.sort(rng.choice(len(good), count, replace=False))]
-    metric = brdf_metric(dictionary.table) if in_metric else None
-    factors = nmf(
-        weight[chosen].astype(np.float64), k, metric=metric, seeds=SEEDS, rng=rng
-    )
+    # of coefficients, the choice of the paper: errors between BRDFs (`brdf_metric`) gave
+    # larger residuals with k = 2, smaller ones from k = 6, and either with k = 4
+    factors = nmf(weight[chosen].astype(np.float64), k, seeds=SEEDS, rng=rng)
     tables = dictionary.table @ factors.H.T.astype(np.float32)
     names = [f"component{i}" for i in range(k)]
     return dataset(
@@ -280,7 +270,6 @@ def reduce_basis(
             "nmf_error": factors.error,
             "nmf_spread": factors.spread,
             "nmf_surfels": len(chosen),
-            "nmf_metric": "brdf" if in_metric else "coefficient",
             "dictionary": dictionary.source,
         },
     )
@@ -321,14 +310,13 @@ def fitted_surfels(fitted: xr.Dataset, names: Sequence[str]) -> Index:
     return np.flatnonzero(good)
 
 
-@dataclass(frozen=True)
-class Systems:
+class Systems(NamedTuple):
     """Normal equations of n surfels, which replace their samples; 28 kB per surfel at m = 59."""
 
     gram: Array  # (n, m, m) M'M
     rhs: Array  # (n, m) M'r
     square: Array  # (n,) r'r
-    count: Array  # (n,) number of values in r
+    samples: Array  # (n,) number of values in r
 
     @classmethod
     def of(cls, rows: Array, offsets: Index, target: Array) -> Systems:
@@ -351,22 +339,12 @@ class Systems:
 
     def within(self, H: Array) -> Systems:
         """Normal equations for the weights of k mixtures H (k, m)."""
-        return Systems(H @ self.gram @ H.T, self.rhs @ H.T, self.square, self.count)
-
-    def __getitem__(self, chosen: Any) -> Systems:
-        return Systems(
-            self.gram[chosen], self.rhs[chosen], self.square[chosen], self.count[chosen]
-        )
+        return Systems(H @ self.gram @ H.T, self.rhs @ H.T, self.square, self.samples)
 
     @staticmethod
     def joined(parts: list[Systems]) -> Systems:
         """Concatenate the systems of several takes."""
-        return Systems(
-            *(
-                np.concatenate([getattr(p, f.name) for p in parts])
-                for f in fields(Systems)
-            )
-        )
+        return Systems(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def residuals(systems: Systems, H: Array | None = None) -> tuple[Array, Array]:
@@ -503,7 +481,8 @@ def _cheapest_merges(systems: Systems, lift: Array, H: Array) -> list[Array]:
     their weighted sum.
     """
     total = residuals(systems, H @ lift)[0].sum(axis=0)
-    few = systems[:: max(1, len(systems.square) // 500)]  # enough to rank candidates
+    step = max(1, len(systems.square) // 500)  # few are enough to rank candidates
+    few = Systems(*(part[::step] for part in systems))
     candidates = [np.delete(H, i, 0) for i in range(len(H))]
     for i in range(len(H)):
         for j in range(i):

@@ -380,14 +380,11 @@ def _fitted(weight, *, status=FitStatus.FITTED):
     )
 
 
-@pytest.mark.parametrize("in_metric", [False, True])
-def test_reduce_basis__finds_the_planted_space(small_dictionary, in_metric):
+def test_reduce_basis__finds_the_planted_space(small_dictionary):
     rng = np.random.default_rng(7)
     rows = np.array([[1.0, 0, 0.5, 0, 0, 0], [0, 1.0, 0, 0, 0.2, 0]])
     weight = rng.uniform(0, 1, (300, 2)) @ rows
-    found = reduce_basis(
-        _fitted(weight), dictionary=small_dictionary, k=2, rng=rng, in_metric=in_metric
-    )
+    found = reduce_basis(_fitted(weight), dictionary=small_dictionary, k=2, rng=rng)
     H = found["basis_mixture"].values
     left = weight - weight @ np.linalg.pinv(H) @ H
     assert np.linalg.norm(left) < 0.02 * np.linalg.norm(weight)

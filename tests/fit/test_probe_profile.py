@@ -45,7 +45,9 @@ def _check(fit, medium=MEDIUM, rtol=2e-3):
     """The fit has the coefficients of the medium."""
     assert fit.status == ProbeStatus.FITTED
     expected = [sigma_tr(*medium), medium[1]]
-    np.testing.assert_allclose([fit.sigma_tr, fit.sigma_s_prime], expected, rtol=rtol)
+    np.testing.assert_allclose(
+        [fit.sigma_tr, fit.reduced_scattering], expected, rtol=rtol
+    )
 
 
 def test_fit_profile__five_fibres_and_2400_readings_give_the_coefficients():
@@ -65,7 +67,7 @@ def test_fit_profile__less_than_three_fibres_are_refused():
         fit = _fit(_profile()[:count], distance=FIBRES[:count])
         assert fit.status == ProbeStatus.TOO_FEW_FIBRES
         assert np.isnan(fit.sigma_tr)
-        assert fit.used == count
+        assert fit.fibres_used == count
 
 
 def test_fit_profile__a_dead_probe_is_refused():
@@ -82,13 +84,13 @@ def test_fit_profile__broken_fibres_are_excluded():
         value[[4, 9]] = broken
         fit = _fit(value, 0.004 * true)
         _check(fit)
-        assert fit.used == 26
+        assert fit.fibres_used == 26
     for broken in (np.nan, np.inf):
         error = 0.004 * true
         error[[4, 9]] = broken
         fit = _fit(true, error)
         _check(fit)
-        assert fit.used == 26
+        assert fit.fibres_used == 26
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,6 @@ from skindb.ingest.photo_offsets import (
     bilinear,
     camera_offset,
     interpolated,
-    nan_quantile,
     reduced,
     relative_brightness,
     square_root_image,
@@ -760,15 +759,4 @@ def test_interpolated__every_picture_as_by_scipy(shape):
     assert 0 < inside.sum() < 400
     np.testing.assert_allclose(
         interpolated(images, pixels).T, np.where(inside, expected, 0), atol=1e-14
-    )
-
-
-@pytest.mark.parametrize("level", [0.0, 0.4, 0.5, 1.0])
-def test_nan_quantile__the_same_bits_as_numpy(level):
-    rng = np.random.default_rng(4)
-    values = rng.random((6, 500))
-    values[rng.random(values.shape) < 0.5] = np.nan
-    values = values[:, np.isfinite(values).any(axis=0)]
-    np.testing.assert_array_equal(
-        nan_quantile(values, level), np.nanquantile(values, level, axis=0)
     )

@@ -90,8 +90,9 @@ def test_systems__residuals_are_those_of_the_rows():
             np.testing.assert_allclose(squares[s], norm**2, rtol=1e-7)
             np.testing.assert_allclose(x[s], want, atol=1e-6 * want.max())
         assert squares[0] == 0  # no samples
-    np.testing.assert_array_equal(systems.count, 3 * np.diff(offsets))
-    whole = Systems.joined([systems[:4], systems[4:]])
+    np.testing.assert_array_equal(systems.samples, 3 * np.diff(offsets))
+    parts = [Systems(*(x[half] for x in systems)) for half in np.s_[:4, 4:]]
+    whole = Systems.joined(parts)
     np.testing.assert_array_equal(whole.gram, systems.gram)
 
 
