@@ -27,11 +27,11 @@ from skindb.store import subject_of
 from skindb.store.place import TAKE
 
 DIMS = set(
-    "surfel face light camera channel channel_2 site fibre dictionary parameter "
-    "measure lobe v u component region xyz uv "
+    "surfel face light camera channel site fibre dictionary parameter "
+    "lobe v u component region xyz uv "
     "corner landmark row col coefficient axis theta_h theta_d phi_d photograph image_row image_col "
     "group k take edge bin trait side level status samples space statistic "
-    "contrast quantity term effect attribute attribute_2 "
+    "contrast quantity term effect attribute "
     "part cell chromophore pair take_2 placement pressure_sample step "
     "response_level exposure correction".split()
 )
