@@ -40,9 +40,9 @@ Design = Literal["parallel", "crossover"]
 COLUMNS = (
     variables.PLAN_SUBJECTS,
     variables.PLAN_ERROR,
-    variables.PLAN_BETWEEN,
-    variables.PLAN_WITHIN,
-    variables.PLAN_KNOWN,
+    variables.BETWEEN_SUBJECT_DEVIATION,
+    variables.RESIDUAL_DEVIATION,
+    variables.KNOWN_SUBJECTS,
 )
 
 

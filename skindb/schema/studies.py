@@ -425,15 +425,15 @@ PLAN_ERROR = declare(
     "float64 plan/plan_error(quantity) [1]",
     "standard error of the term with as many subjects, in the unit of the quantity",
 )
-PLAN_BETWEEN = declare(
+BETWEEN_SUBJECT_DEVIATION = declare(
     "float64 plan/between_subject_deviation(quantity) [1]",
     "standard deviation between subjects, from repeated takes",
 )
-PLAN_WITHIN = declare(
+RESIDUAL_DEVIATION = declare(
     "float64 plan/residual_deviation(quantity) [1]",
     "standard deviation between takes of a subject",
 )
-PLAN_KNOWN = declare(
+KNOWN_SUBJECTS = declare(
     "int32 plan/known_subjects(quantity) [1]",
     "subjects from whose takes the deviations come",
 )
