@@ -428,6 +428,7 @@ from skindb.ingest import spool
 from skindb.workflow import ingest_take
 from skindb.store import Database
 from skindb.store.stage import Stage
+from skindb.types import silent
 
 def die(stage, step, _):
     if (stage, step) == ("sample", 5):
@@ -435,7 +436,8 @@ def die(stage, step, _):
 
 spool.JOURNAL_INTERVAL_SECONDS = 0.0
 if sys.argv[3] == "write":
-    die, Stage.commit = None, lambda *_: os._exit(9)
+    die = silent
+    Stage.commit = lambda *_: os._exit(9)
 ingest_take(Database(sys.argv[1]), sys.argv[2], spacing_mm=8.0, progress=die)
 """
 
