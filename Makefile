@@ -12,12 +12,13 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile -m "not slow"
 
-# every test, then what pages state: the schema, words and commands of all pages, the README, notebooks, the site
-test-all:
-	$(MAKE) suite
-	$(MAKE) pages
-	$(MAKE) readme
-	$(MAKE) --jobs 2 --output-sync=target commands notebooks
+# what pages state (the schema, words, the README's commands, with `make demo`), every test, then the commands
+# of the other pages, the notebooks and the site; bash says how long each part took
+test-all: SHELL := bash
+test-all: $(STAMP)
+	time $(MAKE) --jobs 2 --output-sync=target readme pages
+	time $(MAKE) suite
+	time $(MAKE) --jobs 2 --output-sync=target commands notebooks
 
 suite: $(STAMP)
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
