@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import MISSING, dataclass
 from typing import TYPE_CHECKING
 
+import click
 import numpy as np
 import pandas as pd
 from scipy import stats
@@ -30,7 +31,7 @@ from skindb.analysis.study import (
 from skindb.analysis.subjects import CONDITION, NORMAL
 from skindb.errors import InputError, input_error, require
 from skindb.numerics.statistics import ROUNDING
-from skindb.parameters import option
+from skindb.parameters import option, require_limits
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
 from skindb.types import Array, Mask
@@ -49,7 +50,7 @@ NAME = r"[A-Za-z_]\w*|`[^`]+`"
 TERMS = re.compile(
     rf"(?:\s|C\(\s*(?:{NAME})\s*\)|(?:{NAME})(?!\s*\()|[01]\b|[-+*:/()])*"
 )
-RANDOM = re.compile(r"\+?\s*\(([^()|]*)\|([^()|]*)\)")
+RANDOM = re.compile(r"(?:^|\+)\s*\(([^()|]*)\|([^()|]*)\)\s*(?=\+|$)")
 # variance of a random effect over that of the residual, below which it is at its bound
 BOUND = 1e-6
 COLUMNS = (
@@ -105,6 +106,7 @@ class MixedModel:
             faults["has random effects 1 and NAME"] = not all(
                 re.fullmatch(NAME, part) for part in slopes
             )
+            faults["has slopes or nested effects, not both"] = bool(slopes and nested)
         if broken := [rule for rule, is_broken in faults.items() if is_broken]:
             raise input_error(f"formula {formula}", broken[0], "another form", EXAMPLE)
         return cls(
@@ -136,8 +138,8 @@ def linear_model(
         subject)`` for slopes that differ between subjects, or with ``(1 | subject/NAME)``
         for values of NAME that differ within them. Takes in other conditions
         than normal are used if the formula names the condition. `baseline` is the value
-        of the subject's first take in the condition normal, which is no row then; its
-        logarithm if that of the quantity is explained.
+        of the subject's first take in the condition normal; the takes of that visit are
+        no rows then. It is the logarithm if that of the quantity is explained.
     contrasts
         Sums of multiples of terms, such as ``treatment[T.b]:visit - treatment[T.c]:visit``,
         which are estimated like terms.
@@ -154,7 +156,7 @@ def linear_model(
         for terms that are constant within subjects or have random slopes, within
         subjects for others, and between nested values for those constant within them.
         Terms of one number are per unit of it, those of words less the first word in
-        the alphabet; contrasts follow them. Attribute "flags".
+        the alphabet, those of conditions less normal; contrasts follow them. Attribute "flags".
 
     Raises
     ------
@@ -169,20 +171,23 @@ def linear_model(
     Schuirmann 1987 (equivalence).
     """
     require_comparable(cohort, "tables")
+    contrasts = (contrasts,) if isinstance(contrasts, str) else tuple(contrasts)
+    require_limits(Parameters(formula, contrasts, margin))
     model = MixedModel.of(formula)
     frame = tidy(cohort)
     unused = {*VALUES, "take"} - {BASELINE}
     known = [name for name in frame.columns if name not in unused]
-    used = _names(model, known)
+    used = names_of(model, known)
     frame = frame[frame["quantity"] == model.quantity]
     if CONDITION not in used:
         frame = frame[frame[CONDITION] == NORMAL]
+    measured = frame.dropna(subset=["value"])
     if model.is_log:
         numbers = frame[["value", BASELINE]]
         frame[["value", BASELINE]] = np.log(numbers.where(numbers > 0))
     frame = _with_levels(model, frame.dropna(subset=["value", *used]))
     fits: dict[str, _Fit] = {}
-    flags: list[str] = []
+    flags = _flags(model, measured, frame)
     reasons: list[str] = []  # of regions without a model
     for (region, channel), part in frame.groupby(
         ["region", "channel"], sort=False, dropna=False
@@ -207,6 +212,31 @@ def linear_model(
     return _labelled(model, fits, flags, cohort, stated)
 
 
+def _flags(model: MixedModel, measured: pd.DataFrame, used: pd.DataFrame) -> list[str]:
+    """Warnings about subjects that are excluded, and about repeats."""
+    flags = []
+    places = ["region", "channel"]
+    for (region, channel), part in measured.groupby(places, sort=False, dropna=False):
+        is_here = used["region"] == region
+        if isinstance(channel, str):
+            is_here &= used["channel"] == channel
+        absent = {*part[SUBJECT]} - {*used[SUBJECT][is_here]}
+        if absent:
+            words = [word for word in (region, channel) if isinstance(word, str)]
+            flags.append(
+                f"{' '.join(words)}: {len(absent)} of {part[SUBJECT].nunique()} subjects "
+                "lack a variable of the formula"
+                + (", or a positive value" if model.is_log else "")
+            )
+    repeated = used.duplicated([*places, SUBJECT, CONDITION, "visit"]).any()
+    if model.is_mixed and not model.nested and repeated:
+        flags.append(
+            "visits have repeats, whose differences count like those of visits; "
+            "(1 | subject/visit) tells them apart"
+        )
+    return flags
+
+
 @dataclass(frozen=True)
 class _Fit:
     """A model of one region and channel."""
@@ -218,7 +248,7 @@ class _Fit:
     flags: tuple[str, ...]
 
 
-def _names(model: MixedModel, known: Sequence[str]) -> list[str]:
+def names_of(model: MixedModel, known: Sequence[str]) -> list[str]:
     """Columns that a model uses."""
     names = sorted({*_words(model), *model.slopes, SUBJECT, model.nested or SUBJECT})
     if unknown := [name for name in names if name not in known]:
@@ -251,6 +281,9 @@ def _with_levels(model: MixedModel, frame: pd.DataFrame) -> pd.DataFrame:
             "correct the attribute in capture.json, and ingest again",
         )
         words[name] = pd.Categorical(values)
+        if name == CONDITION and NORMAL in words[name].categories:
+            others = words[name].categories.drop(NORMAL)
+            words[name] = words[name].reorder_categories([NORMAL, *others])
         require(
             len(words[name].categories) != 1,
             f"formula: {name}",
@@ -275,7 +308,14 @@ def _fit(
     if model.nested:
         cells = rows.groupby([SUBJECT, model.nested], observed=True).ngroup()
         groups.append(cells.to_numpy())
+    random = np.column_stack(
+        [np.ones(len(rows)), *(_numbers(rows, name) for name in model.slopes)]
+    )
     free = _degrees_of_freedom(x, groups, np.isin(terms, of_slopes))
+    if model.slopes:
+        # subjects in whom the number of a slope does not differ say nothing about it
+        levels = pd.DataFrame(random[:, 1:]).groupby(subjects).nunique()
+        free[np.isin(terms, of_slopes)] -= people - (levels > 1).sum().min()
     require(
         free.min() > 0 and np.linalg.matrix_rank(x) == len(terms),
         "formula",
@@ -308,17 +348,19 @@ def _fit(
         f"the same in {len(rows)} takes",
     )
     scale = float(np.std(y))  # so that the solver converges
-    random = np.column_stack(
-        [np.ones(len(rows)), *(_numbers(rows, name) for name in model.slopes)]
-    )
-    estimate, covariance, spread = _solve(y / scale, x, groups, random)
+    try:
+        estimate, covariance, spread = _solve(y / scale, x, groups, random)
+    except np.linalg.LinAlgError:
+        raise input_error(
+            "formula", "must be determined", "no maximum of the likelihood was found"
+        ) from None
     table = _inference(
         (scale * estimate, scale**2 * covariance, free), terms, contrasts, margin
     )
     effects = [INTERCEPT, *model.slopes] if model.is_mixed else []
     size = np.sqrt((random**2).mean(axis=0))  # whatever the units of the slopes are
     if model.nested:
-        effects.append(model.nested)
+        effects.append(f"{SUBJECT}/{model.nested}")
         size = np.append(size, 1.0)
     at_bound = [
         effect
@@ -330,7 +372,7 @@ def _fit(
         dict(zip([*effects, RESIDUAL], scale * spread, strict=True)),
         len(rows),
         people,
-        tuple(f"no variance of {effect} between subjects" for effect in at_bound),
+        tuple(f"no variance of {effect} was found" for effect in at_bound),
     )
 
 
@@ -359,7 +401,9 @@ def design_of(
     try:
         design = model_matrix(model.fixed, rows, na_action="raise")
     except (FormulaicError, ValueError, TypeError, SyntaxError) as broken:
-        raise input_error("formula", "must fit the data", f"{broken}"[:200]) from None
+        raise input_error(
+            "formula", "must fit the data", click.unstyle(f"{broken}")[:200]
+        ) from None
     x = np.asarray(design, float)
     is_present = x.any(axis=0)  # levels that this region has
     terms = [str(name) for name in design.columns[is_present]]
@@ -413,6 +457,7 @@ def _inference(
 ) -> pd.DataFrame:
     """Variables of terms and contrasts, from estimates, covariance and degrees of freedom."""
     estimate, covariance, free = fitted
+    contrasts = [name for name in dict.fromkeys(contrasts) if name not in terms]
     sums = np.vstack([np.eye(len(terms)), *(sum_of(name, terms) for name in contrasts)])
     estimate = sums @ estimate
     error = np.sqrt(np.einsum("ij,jk,ik->i", sums, covariance, sums))
@@ -438,7 +483,7 @@ def sum_of(contrast: str, terms: Sequence[str]) -> Array:
     from patsy import DesignInfo, PatsyError
 
     try:
-        found = DesignInfo(terms).linear_constraint(contrast)
+        found = DesignInfo(terms).linear_constraint(contrast.replace("`", ""))
     except (PatsyError, IndexError):  # the latter for an empty text
         found = None
     require(

@@ -21,7 +21,7 @@ from skindb.analysis.quantities import (
 from skindb.analysis.subjects import CONDITION, NORMAL, subjects_of
 from skindb.errors import require
 from skindb.schema.cohort import require_takes, visit_of
-from skindb.types import Array, Index, Mask
+from skindb.types import Array, Index
 
 KEYS = ("take", "subject", CONDITION, "visit", "repeat")
 COLUMNS = (
@@ -54,7 +54,7 @@ def tidy(cohort: Dataset) -> pd.DataFrame:
         none to be trusted, in `unit`; `error`, its standard error without
         `common_error`, the errors of level and model, which are taken to be the same
         for all takes; `baseline`, the value of the subject's first take in the condition
-        normal, NaN for that take itself; status; label (the class of an individual
+        normal, NaN for the takes of that visit; status; label (the class of an individual
         typology angle); and each attribute of the captures, as ``attribute_<name>`` if
         it has the name of another column. Takes without a white target have R_d with
         the status "relative" and no colours.
@@ -95,7 +95,10 @@ def tidy(cohort: Dataset) -> pd.DataFrame:
     )
     baseline = _baseline(takes)
     compared = [*measured, *_differences(measured, baseline)]
-    rows = [_rows(one, baseline) for one in compared]
+    visits = takes["visit"].to_numpy()
+    is_first = (takes[CONDITION] == NORMAL) & (visits == visits[baseline])
+    before = np.where(is_first, -1, baseline)
+    rows = [_rows(one, before) for one in compared]
     table = takes.merge(pd.concat(rows), left_index=True, right_index=True)
     return table[[*KEYS, *COLUMNS, *attributes]].reset_index(drop=True)
 
@@ -107,19 +110,16 @@ def _baseline(takes: pd.DataFrame) -> Index:
     return np.array([first.get(subject, -1) for subject in takes["subject"]])
 
 
-def _has_baseline(baseline: Index) -> Mask:
-    """Whether (take,) there is a baseline that is another take."""
-    return np.asarray((baseline >= 0) & (baseline != np.arange(len(baseline))))
-
-
 def _rows(measured: Measurement, baseline: Index) -> pd.DataFrame:
-    """Rows of a quantity, whose index is the number of the take."""
+    """Rows of a quantity, whose index is the number of the take; `baseline` is -1 for
+    takes without.
+    """
     quantity = measured.quantity
     labels = [*itertools.product(*measured.labels)]
     count = len(measured.values)
     values = measured.values.ravel()
     before = measured.values[baseline]
-    before[~_has_baseline(baseline)] = np.nan
+    before[baseline < 0] = np.nan
     is_angle = quantity.name == TYPOLOGY_ANGLE
     columns = (
         quantity.name,
@@ -142,7 +142,8 @@ def _differences(measured: list[Measurement], baseline: Index) -> Iterator[Measu
     reflectance = next((one for one in measured if one.quantity == REFLECTANCE), None)
     if reflectance is None:
         return
-    is_compared = _has_baseline(baseline)
+    is_own = baseline == np.arange(len(baseline))
+    is_compared = (baseline >= 0) & ~is_own
     is_absolute = (reflectance.status != "relative").all(axis=(1, 2))
     is_compared &= is_absolute & is_absolute[baseline]
     before = reflectance.values[baseline]
@@ -164,9 +165,7 @@ def _differences(measured: list[Measurement], baseline: Index) -> Iterator[Measu
     values[~is_compared] = np.nan
     errors[~is_compared] = np.nan
     absent = np.where(is_compared, "missing", "no baseline")[:, None]
-    absent = np.where(
-        (baseline == np.arange(len(baseline)))[:, None], "baseline", absent
-    )
+    absent = np.where(is_own[:, None], "baseline", absent)
     words = np.where(np.isfinite(values), "fitted", absent)
     yield Measurement(
         replace(REFLECTANCE, name=COLOUR_DIFFERENCE, dims=("region",)),

@@ -20,12 +20,14 @@ from skindb.analysis.formula_models import (
     information_of,
     is_constant_within,
     linear_model,
+    names_of,
     sum_of,
 )
 from skindb.analysis.study import Population, Results, Study, Table, table_of
 from skindb.errors import require
-from skindb.parameters import option
+from skindb.parameters import option, require_limits
 from skindb.schema import dataset, variables
+from skindb.schema.cohort import visit_of
 from skindb.types import Array, Index
 
 if TYPE_CHECKING:
@@ -61,8 +63,8 @@ def sample_sizes(
     Parameters
     ----------
     cohort
-        ``db.cohort("tables")`` with several takes of subjects in the condition normal,
-        from which the variances between and within subjects come.
+        ``db.cohort("tables")`` with several visits of subjects in the condition normal,
+        from whose first takes the variances between and within subjects come.
     formula
         As in `linear_model`, of `treatment` (0 or 1) and `visit` (1, 2, ...), with ``(1 |
         subject)``.
@@ -96,7 +98,10 @@ def sample_sizes(
     Noncentral t with the degrees of freedom of `linear_model`; Fitzmaurice, Laird and
     Ware 2011, chapter 20.
     """
+    require_limits(Parameters(formula, term, effect, power, visits, design))
     model = MixedModel.of(formula)
+    names_of(model, [SUBJECT, "treatment", "visit"])
+    require(effect != 0, "effect", "must differ from 0", "0", "give another value")
     require(
         model.is_mixed and not model.slopes and not model.nested,
         f"formula {formula}",
@@ -113,7 +118,10 @@ def sample_sizes(
         "use fewer terms or more visits",
     )
     quantity = formula.partition("~")[0].strip()
-    known = linear_model(cohort, formula=f"{quantity} ~ 1 + (1 | subject)")
+    first = [visit_of(str(take))[1] == 1 for take in cohort["take"].values]
+    known = linear_model(
+        cohort.isel(take=first), formula=f"{quantity} ~ 1 + (1 | subject)"
+    )
     deviations = known[variables.MODEL_DEVIATION].sel(effect=[INTERCEPT, RESIDUAL])
     factors = sum_of(term, terms)
     counts = np.arange(PEOPLE, MAX_SUBJECTS + 1, PEOPLE if design == PARALLEL else 1)
@@ -190,7 +198,7 @@ def describe_plan(table: Dataset) -> list[str]:
         f"{about['formula']}: subjects in total that show {about['term']} = "
         f"{about['effect']:g} at 5 % with a power of {100 * about['power']:g} %, "
         f"{about['design']}, {about['visits']} visits; empty for more than {MAX_SUBJECTS:,}",
-        "variances come from the repeated takes of the subjects of the database; those who "
+        "variances come from the visits of the subjects of the database; those who "
         "leave the study are not counted",
         *about["flags"],
     ]

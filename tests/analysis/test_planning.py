@@ -81,7 +81,11 @@ def test_sample_sizes__too_small_an_effect_has_no_number(cohort):
         ),
         ({"visits": 1}, "must be determined by the design"),
         ({"term": "dose"}, "not a sum of multiples of Intercept, treatment"),
-        ({"formula": "R_d ~ age + (1 | subject)"}, "must fit the data"),
+        ({"formula": "R_d ~ age + (1 | subject)"}, "choose from: subject, treatment"),
+        ({"effect": 0.0}, "effect: must differ from 0"),
+        ({"effect": np.nan}, "effect: must lie in"),
+        ({"power": 1.0}, "power: must lie in"),
+        ({"design": "cluster"}, "design: must be one of parallel, crossover"),
     ],
 )
 def test_sample_sizes__refuses(cohort, options, said):
@@ -98,3 +102,18 @@ def test_sample_sizes__need_repeats(cohort):
             term="treatment",
             effect=1,
         )
+
+
+def test_sample_sizes__repeats_are_no_visits(cohort):
+    """Visits of two takes: only the first ones count."""
+    takes = [
+        f"{name}.normal.{1 + i // 2}.{1 + i % 2}"
+        for name in cohort["subject"].values[::4]
+        for i in range(4)
+    ]
+    options = {"formula": FORMULA, "term": "visit", "effect": 0.01, "visits": 3}
+    repeated = sample_sizes(cohort.assign_coords(take=takes), **options)
+    first = sample_sizes(
+        cohort.isel(take=[i for i in range(96) if not i % 2]), **options
+    )
+    assert repeated["residual_deviation"].equals(first["residual_deviation"])
