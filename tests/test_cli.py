@@ -299,7 +299,6 @@ def test_cli__custom_dictionary(tmp_path):
     assert row["normal_albedo"] == pytest.approx(0.5, rel=1e-3)
     # without a disc there is no error of the disc
     assert row["hole_fraction"] == 0
-    assert said["notes"] == ["a file of tables: grey"]
 
 
 @pytest.fixture(scope="module")
