@@ -63,7 +63,7 @@ MAX_VIRTUAL_PIXELS = 8_000_000  # of a simulated frame, which needs 250 bytes ea
 MAX_PICTURE_PIXELS = 16_000_000
 MAX_WORKERS = 256
 MAX_WAIT_S = 7 * 24 * 3600.0
-MAX_SEED = 2**32 - 1
+MAX_SEED = 10**9
 MAX_PERMUTATIONS = 1_000_000
 MAX_PHOTOGRAPHS = 64  # that an ingest keeps
 # of a surface that is estimated from pictures; the equations of more take minutes

@@ -181,8 +181,9 @@ def broken_rule(limits: Option, hint: Any, value: Any) -> str:
     if words:
         return f"must be {', '.join(words)}, or a number from {_short(low)} to {_short(high)}"
     if high is None:
-        return f"must be at least {low:g}"
-    return f"must lie in {'(' if limits.above_minimum else '['}{low:g}, {high:g}]"
+        return f"must be at least {_short(low)}"
+    start = "(" if limits.above_minimum else "["
+    return f"must lie in {start}{_short(low)}, {_short(high)}]"
 
 
 def _short(number: float | None) -> str:

@@ -118,7 +118,7 @@ def test_cli__every_number_has_a_largest_value():
         (
             ("simulate", "{tmp}", "--seed", "1" * 40),
             2,
-            "is not in the range 0<=x<=4294967295",
+            "is not in the range 0<=x<=1000000000",
         ),
         (
             ("ingest", "{tmp}", "{tmp}", "--workers", "100000"),

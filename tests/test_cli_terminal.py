@@ -43,7 +43,7 @@ def test_main__escapes_results_faults_and_wrong_usage(tmp_path):
         for line in lines_of(_run("info", f"--{shown}").stderr)
     )
     # a message of several lines
-    assert lines_of(_run("analyze", "x").stderr)[-2].strip() == "model"
+    assert lines_of(_run("analyze", "x").stderr)[-2].strip() == "plan"
 
 
 def test_main__escapes_warnings():

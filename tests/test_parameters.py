@@ -53,7 +53,7 @@ def test_parameters__every_fault_is_reported_at_once():
         "mode: must be one of perceptual, linear; found 'loud'; give another value",
         "eta: must lie in [1, 2]; found nan; give another value",
         "hold_out_lights: must lie in [0, 0.9]; found 1.5; give another value",
-        "seed: must be at least 0; found -1; give another value",
+        "seed: must lie in [0, 1e9]; found -1; give another value",
     ]
 
 
