@@ -163,11 +163,14 @@ def _stored_records(
             stored[take] = version
     if missing:
         kind = records[missing[0]].kind
+        data = {
+            "maps": f"maps of {request.size} texels",
+            "surfels": f"a sample of {request.surfels} surfels",
+        }.get(request.layout, request.layout)
         raise input_error(
             few_names(missing),
-            f"a version of kind {kind} must store what the cohort of {request.layout} needs: "
-            f"surfels {request.surfels}, size {request.size}",
-            "none, or different ones",
+            f"the {kind} must store {data}",
+            "none, or others",
             "call skindb.workflow.summarise for them",
         )
     return stored
