@@ -36,6 +36,7 @@ TOO_FEW = (
     "the subjects must determine the effect",
     "subjects must have two takes",
     "some region must determine it",
+    "must differ between takes",
 )
 
 
