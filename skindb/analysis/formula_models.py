@@ -4,22 +4,27 @@
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import MISSING, dataclass
 from typing import TYPE_CHECKING
 
-import click
 import numpy as np
 import pandas as pd
 from scipy import stats
 from xarray import Dataset
 
 from skindb import plots
+from skindb.analysis.formulas import (
+    SUBJECT,
+    MixedModel,
+    design_of,
+    names_of,
+    sum_of,
+    with_levels,
+)
 from skindb.analysis.long_form import COLUMNS as VALUES
 from skindb.analysis.long_form import tidy
-from skindb.analysis.quantities import COLOUR_DIFFERENCE, QUANTITIES
 from skindb.analysis.study import (
     Population,
     Results,
@@ -39,18 +44,9 @@ from skindb.types import Array, Mask
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-SUBJECT = "subject"
 BASELINE = "baseline"
 RESIDUAL = "residual"
-MODELLED = (*QUANTITIES, COLOUR_DIFFERENCE)
 INTERCEPT = "Intercept"
-EXAMPLE = "write, for example: ITA ~ treatment * visit + age + (1 | subject)"
-# what a formula may consist of: formulaic would evaluate any Python expression
-NAME = r"[A-Za-z_]\w*|`[^`]+`"
-TERMS = re.compile(
-    rf"(?:\s|C\(\s*(?:{NAME})\s*\)|(?:{NAME})(?!\s*\()|[01]\b|[-+*:/()])*"
-)
-RANDOM = re.compile(r"(?:^|\+)\s*\(([^()|]*)\|([^()|]*)\)\s*(?=\+|$)")
 # variance of a random effect over that of the residual, below which it is at its bound
 BOUND = 1e-6
 COLUMNS = (
@@ -63,60 +59,6 @@ COLUMNS = (
     variables.MODEL_P_EQUIVALENCE,
     variables.MODEL_DEGREES_OF_FREEDOM,
 )
-
-
-@dataclass(frozen=True)
-class MixedModel:
-    """A formula in parts."""
-
-    quantity: str
-    is_log: bool
-    fixed: str  # terms, as of formulaic
-    slopes: tuple[str, ...] = ()  # numbers whose slopes differ between subjects
-    is_mixed: bool = False  # whether subjects have intercepts of their own
-    nested: str = ""  # column whose values have intercepts of their own in each subject
-
-    @classmethod
-    def of(cls, formula: str) -> MixedModel:
-        """Parse a formula; `InputError` for one that has other parts."""
-        left, separator, right = formula.partition("~")
-        logarithm = re.fullmatch(r"log\((.*)\)", left.strip())
-        quantity = (logarithm[1] if logarithm else left).strip()
-        random = RANDOM.findall(right)
-        fixed = RANDOM.sub("", right).strip().removeprefix("+").strip() or "1"
-        faults = {
-            "must have one ~ between a quantity and terms": not separator
-            or "~" in right,
-            f"must begin with one of {', '.join(MODELLED)}": quantity not in MODELLED,
-            "has at most one random part, (1 | subject), (1 + NAME | subject) or "
-            "(1 | subject/NAME)": len(random) > 1,
-            "has the terms NAME, C(NAME), 0 and 1, joined by + - * : / ( )": not TERMS.fullmatch(
-                fixed
-            ),
-        }
-        slopes: list[str] = []
-        nested = ""
-        for effects, group in random:
-            slopes = [part.strip() for part in effects.split("+")]
-            slopes = [part for part in slopes if part != "1"]
-            outer, is_nested, nested = (part.strip() for part in group.partition("/"))
-            faults["has random effects of subjects, or of NAME within subjects"] = (
-                outer != SUBJECT or bool(is_nested and not re.fullmatch(NAME, nested))
-            )
-            faults["has random effects 1 and NAME"] = not all(
-                re.fullmatch(NAME, part) for part in slopes
-            )
-            faults["has slopes or nested effects, not both"] = bool(slopes and nested)
-        if broken := [rule for rule, is_broken in faults.items() if is_broken]:
-            raise input_error(f"formula {formula}", broken[0], "another form", EXAMPLE)
-        return cls(
-            quantity,
-            logarithm is not None,
-            fixed,
-            tuple(part.strip("`") for part in slopes),
-            bool(random),
-            nested.strip("`"),
-        )
 
 
 def linear_model(
@@ -155,8 +97,9 @@ def linear_model(
         Student's intervals and p values with the degrees of freedom between subjects
         for terms that are constant within subjects or have random slopes, within
         subjects for others, and between nested values for those constant within them.
-        Terms of one number are per unit of it, those of words less the first word in
-        the alphabet, those of conditions less normal; contrasts follow them. Attribute "flags".
+        Terms of one number are per unit of it, those of words less the first word,
+        where week 2 is before week 10, those of conditions less normal; contrasts
+        follow them. Attribute "flags".
 
     Raises
     ------
@@ -185,9 +128,13 @@ def linear_model(
     if model.is_log:
         numbers = frame[["value", BASELINE]]
         frame[["value", BASELINE]] = np.log(numbers.where(numbers > 0))
-    frame = _with_levels(model, frame.dropna(subset=["value", *used]))
+    frame = with_levels(model, frame.dropna(subset=["value", *used]))
     fits: dict[str, _Fit] = {}
     flags = _flags(model, measured, frame)
+    if late := sorted(_late_baselines(measured)) if BASELINE in used else []:
+        flags.append(
+            f"the baseline of {', '.join(late)} is of a later visit than others"
+        )
     reasons: list[str] = []  # of regions without a model
     for (region, channel), part in frame.groupby(
         ["region", "channel"], sort=False, dropna=False
@@ -237,6 +184,15 @@ def _flags(model: MixedModel, measured: pd.DataFrame, used: pd.DataFrame) -> lis
     return flags
 
 
+def _late_baselines(rows: pd.DataFrame) -> set[str]:
+    """Subjects whose first take in the condition normal is of a later visit than those
+    of others.
+    """
+    normal = rows[rows[CONDITION] == NORMAL]
+    first = normal.groupby(SUBJECT)["visit"].min()
+    return {*first.index[first > first.min()]}
+
+
 @dataclass(frozen=True)
 class _Fit:
     """A model of one region and channel."""
@@ -246,52 +202,6 @@ class _Fit:
     takes: int
     subjects: int
     flags: tuple[str, ...]
-
-
-def names_of(model: MixedModel, known: Sequence[str]) -> list[str]:
-    """Columns that a model uses."""
-    names = sorted({*_words(model), *model.slopes, SUBJECT, model.nested or SUBJECT})
-    if unknown := [name for name in names if name not in known]:
-        raise input_error(
-            f"formula: {', '.join(unknown)}",
-            "must be columns of the takes",
-            "unknown names",
-            f"choose from: {', '.join(known)}",
-        )
-    return names
-
-
-def _with_levels(model: MixedModel, frame: pd.DataFrame) -> pd.DataFrame:
-    """The rows, with words and C(NAME) as categories, so that terms mean the same in
-    all regions.
-    """
-    words: dict[str, pd.Categorical] = {}
-    factors = re.findall(rf"C\(\s*({NAME})\s*\)", model.fixed)
-    factors = [name.strip("`") for name in factors]
-    for name in _words(model):
-        values = frame[name]
-        if pd.api.types.is_numeric_dtype(values) and name not in factors:
-            continue
-        kinds = sorted({type(value).__name__ for value in values})
-        require(
-            len(kinds) < 2,
-            f"formula: {name}",
-            "must be all numbers or all words",
-            f"values of {' and '.join(kinds)}",
-            "correct the attribute in capture.json, and ingest again",
-        )
-        words[name] = pd.Categorical(values)
-        if name == CONDITION and NORMAL in words[name].categories:
-            others = words[name].categories.drop(NORMAL)
-            words[name] = words[name].reorder_categories([NORMAL, *others])
-        require(
-            len(words[name].categories) != 1,
-            f"formula: {name}",
-            "must differ between takes",
-            f"{name} is {values.iloc[0]} in all of them" if len(values) else "",
-            "omit it",
-        )
-    return frame.assign(**words)
 
 
 def _fit(
@@ -388,37 +298,6 @@ def _degrees_of_freedom(x: Array, groups: Sequence[Array], of_slopes: Mask) -> A
     return np.asarray((np.diff(counts) - terms)[level], float)
 
 
-def design_of(
-    model: MixedModel, rows: pd.DataFrame
-) -> tuple[Array, list[str], list[str]]:
-    """Columns (n, p) of the fixed terms that are not 0 everywhere, the names of these
-    terms, and of those that contain a random slope.
-    """
-    # takes longer to import than most commands to run
-    from formulaic import model_matrix
-    from formulaic.errors import FormulaicError
-
-    try:
-        design = model_matrix(model.fixed, rows, na_action="raise")
-    except (FormulaicError, ValueError, TypeError, SyntaxError) as broken:
-        raise input_error(
-            "formula", "must fit the data", click.unstyle(f"{broken}")[:200]
-        ) from None
-    x = np.asarray(design, float)
-    is_present = x.any(axis=0)  # levels that this region has
-    terms = [str(name) for name in design.columns[is_present]]
-    require(terms, "formula", "must have fixed terms", "no fixed term", EXAMPLE)
-    of_slopes = [
-        str(design.columns[column])
-        for term, columns in design.model_spec.term_indices.items()
-        if not {
-            str(name) for name in design.model_spec.term_variables[term]
-        }.isdisjoint(model.slopes)
-        for column in columns
-    ]
-    return x[:, is_present], terms, of_slopes
-
-
 def is_constant_within(x: Array, subjects: Array) -> Mask:
     """Whether each column (n, p) is constant within subjects (n,)."""
     people = len(set(subjects))
@@ -476,24 +355,6 @@ def _inference(
         inside = (margin - np.abs(estimate)) / error
         columns[variables.MODEL_P_EQUIVALENCE] = stats.t.sf(inside, free)
     return pd.DataFrame(columns, [*terms, *contrasts])
-
-
-def sum_of(contrast: str, terms: Sequence[str]) -> Array:
-    """Factors (terms,) of the terms in a contrast."""
-    from patsy import DesignInfo, PatsyError
-
-    try:
-        found = DesignInfo(terms).linear_constraint(contrast.replace("`", ""))
-    except (PatsyError, IndexError):  # the latter for an empty text
-        found = None
-    require(
-        found is not None and len(found.coefs) == 1 and not found.constants.any(),
-        f"contrast {contrast}",
-        "must be a sum of multiples of terms",
-        f"contrast {contrast} is not a sum of multiples of {', '.join(terms)}",
-        "write, for example: NAME - 2 * NAME",
-    )
-    return np.asarray(found.coefs[0], float)
 
 
 def _numbers(rows: pd.DataFrame, name: str) -> Array:
@@ -580,16 +441,11 @@ def _labelled(
         coords={"quantity": list(fits), "term": terms, "effect": effects},
         attrs={
             **stated,
-            "condition": "" if CONDITION in _words(model) else NORMAL,
+            "condition": "" if CONDITION in model.names else NORMAL,
             "flags": flags,
             "skipped": skipped_takes(cohort),
         },
     )
-
-
-def _words(model: MixedModel) -> set[str]:
-    """Names in the fixed terms."""
-    return {word.strip("`") for word in re.findall(NAME, model.fixed)} - {"C"}
 
 
 def tabulate_model(table: Dataset) -> Table:

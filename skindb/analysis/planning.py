@@ -14,12 +14,14 @@ from skindb import plots
 from skindb.analysis.formula_models import (
     INTERCEPT,
     RESIDUAL,
-    SUBJECT,
-    MixedModel,
-    design_of,
     information_of,
     is_constant_within,
     linear_model,
+)
+from skindb.analysis.formulas import (
+    SUBJECT,
+    MixedModel,
+    design_of,
     names_of,
     sum_of,
 )

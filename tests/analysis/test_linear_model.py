@@ -13,7 +13,8 @@ from scipy import stats
 from statsmodels.stats.weightstats import ttost_ind
 
 from skindb.analysis import linear_model, tidy
-from skindb.analysis.formula_models import MixedModel, _fit
+from skindb.analysis.formula_models import _fit
+from skindb.analysis.formulas import MixedModel, design_of, with_levels
 from skindb.errors import InputError
 
 PEOPLE, VISITS = 24, 4
@@ -275,6 +276,29 @@ def test_linear_model__no_variance_between_subjects_is_flagged():
     )
     assert "R_d face R: no variance of Intercept was found" in table.attrs["flags"]
     assert np.isfinite(table["model_error"]).all()
+
+
+def test_linear_model__words_are_in_the_order_of_their_numbers():
+    rows = pd.DataFrame({"subject": "S", "C": ["week 10", "week 2", "rest"] * 2})
+    model = MixedModel.of("R_d ~ C(C) + (1 + `a + b` | subject)")
+    assert model.slopes == ("a + b",)
+    terms = design_of(model, with_levels(model, rows))[1]
+    assert terms == ["Intercept", "C[T.week 2]", "C[T.week 10]"]
+    numbers = with_levels(model, rows.assign(C=[10.0, -2.0, 1.5] * 2))
+    assert numbers["C"].cat.categories.tolist() == [-2.0, 1.5, 10.0]
+
+
+def test_linear_model__says_whose_baseline_is_of_a_later_visit():
+    cohort = planted()
+    first = cohort["take"].values[0]
+    table = linear_model(
+        cohort.drop_sel(take=first),
+        formula="R_d ~ treatment + baseline + (1 | subject)",
+    )
+    said = [flag for flag in table.attrs["flags"] if "later visit" in flag]
+    assert said == [
+        f"the baseline of {first.split('.')[0]} is of a later visit than others"
+    ]
 
 
 @pytest.mark.parametrize(
