@@ -70,14 +70,16 @@ class KernelFiles(IndexDataCacheFile):  # type: ignore[misc]
 
 def digest(compiled: Any) -> str:
     """Digest of Python, Numba and our compiler, of a kernel, of all functions that it
-    calls and of all constants that these use; independent of comments and lines.
+    calls and of all constants that these use; independent of comments and lines, and of
+    print options, which colour-science sets.
     """
     waiting = [compiled]
     parts: dict[Any, str] = {}
     while waiting:
         value = waiting.pop()
         if value not in parts:
-            parts[value], used = _function_parts(value)
+            with np.printoptions(legacy=False):
+                parts[value], used = _function_parts(value)
             waiting += used
     compiler = Path(__file__).with_name("kernel_compiler.py").read_text()
     versions = f"{sys.implementation.cache_tag} {nb.__version__} {compiler}"
