@@ -334,7 +334,7 @@ def common_maps(
             weight_inside = np.where(outside, np.float32(0), weight)
             found[variables.TEXEL_COVERAGE] = weight_inside
         filled = (
-            push_pull(image, weight)[0] if trust.any() else np.full_like(image, np.nan)
+            push_pull(image, weight) if trust.any() else np.full_like(image, np.nan)
         )
         filled[outside] = np.nan
         found[f"texel_{name}"] = filled if fitted[name].ndim == 2 else filled[..., 0]

@@ -136,7 +136,7 @@ def log_albedo(maps: Dataset) -> tuple[Array, Mask]:
     log, measured = _measured_log(maps)
     if not measured.any():
         return np.zeros_like(log), measured
-    return push_pull(log, measured.astype(np.float32))[0], measured
+    return push_pull(log, measured), measured
 
 
 def _measured_log(maps: Dataset) -> tuple[Array, Mask]:

@@ -83,7 +83,7 @@ class Atlas:
         # evenly doubtful regions stay sharp
         tiny = np.finfo(np.float32).tiny
         surest = np.maximum(ndimage.maximum_filter(confidence, 3), tiny)
-        return push_pull(image, confidence / surest)[0]
+        return push_pull(image, confidence / surest)
 
     def spread_known(
         self, parts: Mapping[str, AnyArray], trust: Float32

@@ -6,7 +6,6 @@ their gaps filled, and sampled.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,8 +47,10 @@ TRIANGLES_PER_BLOCK = 1 << 17  # takes 50 MB
 # relative to the summed products: the sign of a larger difference is correct (Shewchuk
 # 1997)
 CERTAIN = 3.4e-16
+PARALLEL = 1e-99  # slope of a weight that does not change along a line
 EDGE = 1e-9  # texels; a texel centre on an edge belongs to both triangles
-TEXELS_PER_BLOCK = 1 << 14  # 300 bytes each
+TEXELS_PER_BLOCK = 1 << 15  # 200 bytes each
+TEXEL_ROWS = 16  # of a map that are interpolated together
 TINY = np.finfo(np.float64).tiny
 Image = Float32
 
@@ -127,16 +128,15 @@ def signed_areas(uv: Array, faces: Faces) -> Float64:
     """Areas (f,) of triangles in the map; positive if they face outwards (u to the
     right, v down).
     """
-    plus, minus = _area_products(uv[faces])
-    return (plus - minus) / 2
+    return _double_areas(uv[faces])[0] / 2
 
 
-def _area_products(corners: Array) -> tuple[Float64, Float64]:
-    """Terms (f,) whose difference is twice the area of triangles (f, 3, 2) in the map."""
+def _double_areas(corners: Array) -> tuple[Float64, Float64]:
+    """Twice the signed areas (f,) of triangles (f, 3, 2), and the limit of their errors."""
     a, b, c = float64(corners).swapaxes(0, 1)
-    ab = b - a
-    ac = c - a
-    return ab[:, 1] * ac[:, 0], ab[:, 0] * ac[:, 1]
+    plus = (b - a)[:, 1] * (c - a)[:, 0]
+    minus = (b - a)[:, 0] * (c - a)[:, 1]
+    return plus - minus, CERTAIN * (np.abs(plus) + np.abs(minus))
 
 
 def _check(n: int, faces: Index, loops: list[Index]) -> None:
@@ -272,8 +272,8 @@ def flipped(uv: Array, faces: Faces) -> Mask:
     """Mask (f,) of the triangles that are turned over in the map, v downwards, or so thin that
     rounding hides it.
     """
-    plus, minus = _area_products(uv[faces])
-    return plus - minus <= CERTAIN * (np.abs(plus) + np.abs(minus))
+    double_area, error = _double_areas(uv[faces])
+    return double_area <= error
 
 
 def stretches(
@@ -395,31 +395,46 @@ def rasterise_atlas(uv: Array, faces: Faces, size: int) -> tuple[Index32, Image]
     """
     face = np.full((size, size), -1, np.int32)
     weight = np.zeros((size, size, 3), np.float32)
-    # texel centres become integers
-    corners = size * float64(uv)[faces] - 0.5
-    low = np.ceil(corners.min(axis=1) - EDGE).clip(0, size).astype(np.int64)
-    high = np.floor(corners.max(axis=1) + EDGE).clip(-1, size - 1).astype(np.int64)
-    sides = np.maximum(high + 1 - low, 0)
-    count = sides.prod(axis=1)
-    count[~(np.abs(signed_areas(uv, faces)) > 0)] = 0
-    blocks = np.flatnonzero(np.diff(np.cumsum(count) // TEXELS_PER_BLOCK)) + 1
+    corner = size * float64(uv).T[:, faces.T] - 0.5  # texel centres become integers
+    low = np.ceil(corner.min(axis=1) - EDGE).clip(0, size).astype(np.int64)
+    high = np.floor(corner.max(axis=1) + EDGE).clip(-1, size - 1).astype(np.int64)
+    width, height = np.maximum(high + 1 - low, 0)
+    corner -= low[:, None]
+    double_area, error = _double_areas(corner.T)
+    height[~(np.abs(double_area) > error)] = 0
+    blocks = np.flatnonzero(np.diff(np.cumsum(width * height) // TEXELS_PER_BLOCK)) + 1
     # a texel under several triangles is written last by the first one
     for block in np.split(np.arange(len(faces)), blocks)[::-1]:
-        triangle = np.repeat(block, count[block])[::-1]
-        first = np.repeat(np.cumsum(count[block]) - count[block], count[block])[::-1]
-        place = np.arange(len(first))[::-1] - first
-        row, column = np.divmod(place, sides[triangle, 0])
-        texel = low[triangle] + np.stack([column, row], axis=1)
-        parts = np.repeat(corners[triangle, None], 3, axis=1)
-        parts[:, [0, 1, 2], [0, 1, 2]] = texel[:, None]
-        area = np.subtract(*_area_products(parts.reshape(-1, 3, 2))).reshape(-1, 3)
-        share = area / area.sum(axis=1, keepdims=True)
-        inside = share.min(axis=1) >= -EDGE
-        column, row = texel[inside].T
-        face[row, column] = triangle[inside]
-        share = share[inside].clip(min=0)
-        weight[row, column] = share / share.sum(axis=1, keepdims=True)
+        block = block[::-1]
+        line, row = _runs(height[block])
+        after = np.roll(corner[..., block], -1, axis=1)
+        before = np.roll(after, -1, axis=1)
+        # the weights of the corners are linear in column and row
+        slope, down = (before - after)[::-1]
+        share = after[1] * before[0] - after[0] * before[1]
+        slope, down, share = (
+            np.stack([slope, down, share])[..., line] / double_area[block[line]]
+        )
+        share -= down * row
+        slope[slope == 0] = PARALLEL
+        end = (-EDGE - share) / slope
+        last = width[block[line]] - 1
+        first = np.ceil(np.where(slope > 0, end, 0).max(axis=0)).clip(0, last + 1)
+        last = np.floor(np.where(slope < 0, end, last).min(axis=0)).clip(-1, last)
+        texel, column = _runs(np.maximum(last + 1 - first, 0).astype(np.int64))
+        column += first[texel].astype(np.int64)
+        share = (share[:, texel] + slope[:, texel] * column).clip(min=0)
+        triangle = block[line[texel]]
+        place = low[1, triangle] + row[texel], low[0, triangle] + column
+        face[place] = triangle
+        weight[place] = (share / share.sum(axis=0)).T
     return face, weight
+
+
+def _runs(count: Index) -> tuple[Index, Index]:
+    """Index of each of `count` (n,) repetitions of n elements, and its place among them."""
+    index = np.repeat(np.arange(len(count)), count)
+    return index, np.arange(len(index)) - np.repeat(np.cumsum(count) - count, count)
 
 
 def atlas_values(
@@ -446,20 +461,25 @@ def atlas_values(
         (size, size): mean trust of the corners, 0 outside.
     """
     face, weight = raster
-    known = np.where(trust[:, None] > 0, values, 0)
+    known = float64(np.where(trust[:, None] > 0, values, 0))
     image = np.zeros((*face.shape, values.shape[1]), np.float32)
     confidence: Image = np.zeros(face.shape, np.float32)
-    for row, triangle in enumerate(face):
-        corners = faces[triangle]  # of any triangle outside, where all weights are 0
-        trusted = float64(weight[row]) * trust[corners]
-        total = trusted.sum(axis=1)
-        mixed = np.einsum("nk,nkc->nc", trusted, known[corners])
-        image[row] = mixed / np.maximum(total, TINY)[:, None]
-        confidence[row] = total
+    for start in range(0, len(face), TEXEL_ROWS):
+        rows = slice(start, start + TEXEL_ROWS)
+        corners = faces[face[rows]]  # of any triangle outside, where all weights are 0
+        trusted = float64(weight[rows]) * trust[corners]
+        total = trusted @ np.ones(3)
+        texels = np.arange(total.size + 1) * 3
+        matrix = sp.csr_array(
+            (trusted.ravel(), corners.ravel(), texels), (total.size, len(known))
+        )
+        mixed = (matrix @ known).reshape(*total.shape, -1)
+        image[rows] = mixed / np.maximum(total, TINY)[..., None]
+        confidence[rows] = total
     return image, confidence
 
 
-def push_pull(image: Array, confidence: Array) -> tuple[Image, Image]:
+def push_pull(image: Array, confidence: AnyArray) -> Image:
     """Fill unknown texels from increasingly coarse averages (Gortler et al. 1996, section 3.5).
 
     Parameters
@@ -471,17 +491,14 @@ def push_pull(image: Array, confidence: Array) -> tuple[Image, Image]:
 
     Returns
     -------
-    image : ndarray
+    ndarray
         (h, w, c) filled; NaN only if nothing is known.
-    confidence : ndarray
-        (h, w): 1 where known; elsewhere that of the average it was filled from, 0 if
-        nothing is known.
     """
     weight = np.nan_to_num(np.clip(float64(confidence), 0, 1))
     weight[~finite_rows(image)] = 0
     filled = np.full(image.shape, np.nan, np.float32)
     if not weight.any():
-        return filled, weight.astype(np.float32)
+        return filled
     weights = [weight]
     while max(weights[-1].shape) > 1:
         weights.append(np.minimum(_pulled(weights[-1]), 1))
@@ -490,19 +507,22 @@ def push_pull(image: Array, confidence: Array) -> tuple[Image, Image]:
         for fine in weights[:-1]:
             levels.append(_pulled(fine * levels[-1]) / np.maximum(_pulled(fine), TINY))
         filled[..., channel] = _pushed(levels, weights)
-    known = _pushed([1.0] * (len(weights) - 1) + [weights[-1]], weights)
-    return filled, known.astype(np.float32)
+    return filled
 
 
 def _pulled(plane: Float64) -> Float64:
     """Sums of 2 x 2 texels, fewer at an odd border."""
-    even = np.pad(plane, [(0, side % 2) for side in plane.shape])
-    return even[::2, ::2] + even[::2, 1::2] + even[1::2, ::2] + even[1::2, 1::2]
+    height, width = plane.shape
+    rows = plane[::2].copy()
+    rows[: height // 2] += plane[1::2]
+    sums = rows[:, ::2].copy()
+    sums[:, : width // 2] += rows[:, 1::2]
+    return sums
 
 
-def _pushed(levels: Sequence[Float64 | float], weights: list[Float64]) -> Float64:
+def _pushed(levels: list[Float64], weights: list[Float64]) -> Float64:
     """The finest level, each blended by its weights with the interpolated coarser one."""
-    out = float64(levels[-1])
+    out = levels[-1]
     for plane, weight in zip(levels[-2::-1], weights[-2::-1], strict=True):
         for axis, side in enumerate(weight.shape):
             near = np.arange(side) // 2

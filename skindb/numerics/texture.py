@@ -285,23 +285,28 @@ def quantile_levels() -> Float64:
 
 
 def quantile_function(values: Image) -> Float64:
-    """Quantiles (QUANTILES,) of values of any shape, subsampled if there are many; NaN
-    if there are none.
-    """
-    flat = np.sort(values.ravel()[:: max(1, values.size // MAX_SORTED)])
+    """Quantiles (QUANTILES,) of values of any shape; NaN if there are none."""
+    flat = np.sort(values, axis=None)
     if not len(flat):
         return np.full(QUANTILES, np.nan)
     # the k-th of n sorted values is the quantile of the fraction (k + 0.5) / n
-    return np.interp(quantile_levels() * len(flat) - 0.5, np.arange(len(flat)), flat)
+    place = np.clip(quantile_levels() * len(flat) - 0.5, 0, len(flat) - 1)
+    below = place.astype(int)
+    low = float64(flat[below])
+    high = flat[np.minimum(below + 1, len(flat) - 1)]
+    return (high - low) * (place - below) + low
 
 
 def part_members(mask: Image, parts: Sequence[Image]) -> list[Index]:
-    """Flat indices of the entries of each part that belong to a region (h, w); see
-    `members`.
+    """Flat indices of the entries of each part that belong to a region (h, w), see
+    `members`, subsampled if there are many.
     """
     shapes = [part.shape for part in parts]
     fractions = dict(zip(shapes, level_fractions(mask, shapes), strict=True))
-    index = {shape: np.flatnonzero(members(f)) for shape, f in fractions.items()}
+    index = {}
+    for shape, fraction in fractions.items():
+        every = np.flatnonzero(members(fraction))
+        index[shape] = every[:: max(1, len(every) // MAX_SORTED)]
     return [index[shape] for shape in shapes]
 
 

@@ -18,12 +18,14 @@ from xarray.core import indexing
 from zarr.codecs import BloscCodec, BytesCodec
 
 from skindb.schema.label import BLOCK_SURFELS
-from skindb.store.place import Place
+from skindb.store.place import BLOCK_BYTES, Place
 from skindb.store.record import Record
 from skindb.store.verified import VerifiedStore
 from skindb.types import AnyArray
 
 INDEX_BYTES = 16  # of a chunk in the index of a shard: offset and length
+# of an object that is read whole: its index and chunks are in the same verified blocks
+SMALL_BYTES = 2 * BLOCK_BYTES
 CHECKSUM_BYTES = 4  # after the index; the digests of the file cover it too
 
 
@@ -72,7 +74,8 @@ class ShardedArray(BackendArray):
         last = first + len(range(begin, end, self.chunk))
         index_bytes = INDEX_BYTES * (self.shard // self.chunk) + CHECKSUM_BYTES
         start = 0
-        if first == 0 and end == min(begin + self.shard, self.shape[0]):
+        whole = first == 0 and end == min(begin + self.shard, self.shape[0])
+        if whole or self.store.files[key].size <= SMALL_BYTES:
             content = memoryview(self.store.read(key))
             index = content[-index_bytes:]
         else:

@@ -106,13 +106,10 @@ def test_push_pull__keeps_what_is_known_and_fills_the_rest(shape):
     known.flat[0] = True
     image[~known] = np.nan
     image = image.astype(np.float32)
-    filled, confidence = push_pull(image, np.ones(shape))
+    filled = push_pull(image, np.ones(shape))
     np.testing.assert_array_equal(filled[known], image[known])
-    np.testing.assert_array_equal(confidence[known], 1)
     assert filled.min() >= np.nanmin(image)
     assert filled.max() <= np.nanmax(image)
-    assert (confidence > 0).all()
-    assert (confidence <= 1).all()
 
 
 @settings(max_examples=30)
@@ -121,7 +118,7 @@ def test_push_pull__constant_stays_constant(height, width, seed):
     rng = np.random.default_rng(seed)
     confidence = rng.random((height, width)) * (rng.random((height, width)) < 0.2)
     confidence[0, -1] = 0.5
-    filled, _ = push_pull(np.full((height, width, 1), 0.7), confidence)
+    filled = push_pull(np.full((height, width, 1), 0.7), confidence)
     np.testing.assert_array_equal(filled, np.float32(0.7))
 
 
@@ -169,7 +166,7 @@ def test_push_pull__agrees_with_loops_over_texels(shape):
     known = rng.random(shape) * (rng.random(shape) < 0.2)
     known[0, 0] = 0.3
     np.testing.assert_allclose(
-        push_pull(image, known)[0], pushed_and_pulled(image, known), atol=FLOAT32
+        push_pull(image, known), pushed_and_pulled(image, known), atol=FLOAT32
     )
 
 
@@ -177,7 +174,7 @@ def test_push_pull__at_the_border_of_the_face_only_the_face_counts():
     y, x = np.mgrid[:64, :64] - 31.5
     face = np.hypot(x, y) < 25
     ramp = np.where(face, x, 1e6)[..., None]  # values outside must not matter
-    filled, _ = push_pull(ramp, face)
+    filled = push_pull(ramp, face)
     np.testing.assert_array_equal(filled[face], ramp[face])
     beside = ~face & (np.hypot(x, y) < 27)
     # the first ring outside, read by bilinear lookups at the rim, is an average of
@@ -190,7 +187,7 @@ def test_push_pull__fills_a_gap_in_a_ramp_smoothly():
     ramp = np.broadcast_to(np.arange(64.0)[:, None, None], (64, 64, 1)).copy()
     hole = ramp.copy()
     hole[20:44, 20:44] = np.nan
-    filled, _ = push_pull(hole, np.ones((64, 64)))
+    filled = push_pull(hole, np.ones((64, 64)))
     # across 24 unknown texels the fill may lag the ramp, not by more than a quarter of the gap
     assert np.abs(filled - ramp).max() < 6
     assert np.abs(np.diff(filled[..., 0], axis=0)).max() < 4
@@ -202,13 +199,11 @@ def test_push_pull__ignores_what_has_no_confidence():
     confidence = np.ones((9, 9))
     for nothing in (0.0, np.nan):
         confidence[4, 4] = nothing
-        np.testing.assert_array_equal(push_pull(image, confidence)[0], 3.0)
+        np.testing.assert_array_equal(push_pull(image, confidence), 3.0)
 
 
 def test_push_pull__nothing_known():
-    filled, confidence = push_pull(np.ones((4, 5, 1)), np.zeros((4, 5)))
-    assert np.isnan(filled).all()
-    assert (confidence == 0).all()
+    assert np.isnan(push_pull(np.ones((4, 5, 1)), np.zeros((4, 5)))).all()
 
 
 def test_maps__take_little_more_memory_than_their_values():
