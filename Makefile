@@ -13,12 +13,11 @@ test: $(STAMP)
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile -m "not slow"
 
 # what pages state (the schema, words, the README's commands, with `make demo`), every test, then the commands
-# of the other pages, the notebooks and the site; bash says how long each part took
-test-all: SHELL := bash
+# of the other pages, the notebooks and the site
 test-all: $(STAMP)
-	time $(MAKE) --jobs 2 --output-sync=target readme pages
-	time $(MAKE) suite
-	time $(MAKE) --jobs 2 --output-sync=target commands notebooks
+	$(MAKE) --jobs 2 --output-sync=target readme pages
+	$(MAKE) suite
+	$(MAKE) --jobs 2 --output-sync=target commands notebooks
 
 suite: $(STAMP)
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
