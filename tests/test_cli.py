@@ -357,21 +357,14 @@ def test_cli__captures_and_databases_belong_to_their_owner_alone(small_database)
 
 @pytest.mark.slow
 def test_cli__fit_processes_takes_without_a_model_of_their_newest_capture(
-    small_database,
+    small_database, tmp_path
 ):
     out, db = small_database
     assert "every take has a model" in _run("fit", db).stderr
-    assert (
-        _run(
-            "ingest",
-            db,
-            str(out / "c/V001"),
-            "--spacing",
-            "5",
-        ).returncode
-        == 0
-    )
-    assert "V001" in json.loads(_run("fit", db, "--json").stdout)
+    copy = str(shutil.copytree(db, tmp_path / "db"))
+    done = _run("ingest", copy, str(out / "c/V001"), "--spacing", "5")
+    assert done.returncode == 0
+    assert list(json.loads(_run("fit", copy, "--explain", "--json").stdout)) == ["V001"]
 
 
 @pytest.mark.slow
@@ -507,10 +500,8 @@ def test_cli__many_takes_at_a_time(tmp_path):
         "V001": 1,
         "V001.lotion": 1,
     }
-    named = _run("fit", db, "V001", "--eta", "1.35", "--light-gains", "on")
-    assert "sigma_tr of cheek: R 0." in named.stdout
-    assert "gains of the lights" in named.stdout
-    plain = json.loads(_run("fit", db, "V001", "--light-gains", "off", "--json").stdout)
+    call = ("fit", db, "V001", "--eta", "1.35", "--light-gains", "off", "--json")
+    plain = json.loads(_run(*call).stdout)
     parameters = plain["V001"]["parameters"]
     assert (parameters["k"], parameters["eta"]) == (2, 1.35)
     assert not parameters["light_gains"]
@@ -849,7 +840,7 @@ def test_cli__an_earlier_generation_is_shown(small_database, tmp_path):
 
 
 @pytest.mark.parametrize(("median", "said"), [(0.05, False), (0.5, True)])
-def test_fit_lines__a_model_that_does_not_explain_the_photographs_is_reported(
+def test_fit_lines__gains_translucency_and_a_model_that_explains_no_photographs(
     median, said
 ):
     report = {
@@ -860,6 +851,14 @@ def test_fit_lines__a_model_that_does_not_explain_the_photographs_is_reported(
         "suspects": [],
         "skipped": [],
         "fit_residual": {"median": median, "p95": 0.9},
+        "light_gains": {"spread": 0.02, "gain": 1.1, "light": "l003"},
+        "translucency": {
+            "cheek": {
+                "sigma_tr": [0.5, 0.7, None],
+                "total_error": [0.1, 0.1, None],
+                "status": ["fitted", "fitted", "dark"],
+            }
+        },
     }
     with click.Context(click.Command("fit")) as context:
         context.meta["verbose"] = False
@@ -871,3 +870,11 @@ def test_fit_lines__a_model_that_does_not_explain_the_photographs_is_reported(
         )
         is said
     )
+    assert (
+        "  sigma_tr of cheek: R 0.5 +- 0.1, G 0.7 +- 0.1, B unknown mm-1 (fitted, dark)"
+        in lines
+    )
+    assert (
+        "  gains of the lights: standard deviation 2.0%; the farthest from 1 is 1.10, of "
+        "light l003"
+    ) in lines
