@@ -30,7 +30,7 @@ from tests.pictures import read_png
 
 COMMANDS = (
     "demo simulate calibrate capture landmarks quick import ingest fit dictionary analyze tidy "
-    "register edit render compare show export "
+    "register reproduce edit render compare show export "
     "view consent release refresh withdraw info audit verify clean"
 ).split()
 

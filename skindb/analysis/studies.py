@@ -1,9 +1,13 @@
 """The studies of a population, and what is shown of a stored one."""
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from xarray import Dataset, DataTree
 
+from skindb import plots
 from skindb.analysis.albedo import STUDY as ALBEDO
 from skindb.analysis.brdf import STUDY as BRDF
 from skindb.analysis.chromophores import STUDY as CHROMOPHORES
@@ -20,7 +24,10 @@ from skindb.analysis.surface import STUDY as SURFACE
 from skindb.analysis.traits import STUDY as TRAITS
 from skindb.analysis.translucency import STUDY as TRANSLUCENCY
 from skindb.files import private_file
-from skindb.plots import plain_text
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 STUDIES: dict[str, Study] = {
     study.name: study
@@ -60,13 +67,17 @@ def describe_study(results: DataTree) -> list[str]:
     return study_of(results).describe(*_shown(results))
 
 
-@plain_text()
+@plots.plain_text()
 def plot_study(results: DataTree, path: Path) -> None:
     """Plot a study and write the figure to a file."""
+    write_plot(study_of(results).plot(*_shown(results)), path)
+
+
+def write_plot(ax: Axes | Figure, path: Path) -> None:
+    """Write a figure, or that of axes, to a file, and close it."""
     from matplotlib import pyplot
 
-    plot = study_of(results).plot(*_shown(results))
-    figure = plot.get_figure(root=True)
+    figure = ax.get_figure(root=True)
     assert figure is not None
     figure.savefig(private_file(path), dpi=150, bbox_inches="tight")
     pyplot.close(figure)

@@ -17,7 +17,7 @@ from skindb.cli.fitting import dictionary_command, fit
 from skindb.cli.imports import import_command, quick
 from skindb.cli.laboratory import calibrate, capture, landmarks
 from skindb.cli.pictures import compare, export, render, show, view
-from skindb.cli.population import edit, register
+from skindb.cli.population import edit, register, reproduce
 from skindb.cli.shared import echo_json, fault_lines
 from skindb.cli.studies import analyze, tidy
 from skindb.cli.subjects import consent, refresh, release, withdraw
@@ -53,6 +53,7 @@ for _command in (
     analyze,
     tidy,
     register,
+    reproduce,
     edit,
     render,
     compare,

@@ -20,10 +20,17 @@ from skindb.cli.options import (
     command,
     options_of,
 )
-from skindb.cli.shared import aligned, cluster, emit, existing, trait_amounts, writable
+from skindb.cli.shared import (
+    aligned,
+    cluster,
+    emit,
+    existing,
+    trait_amounts,
+    writable,
+)
 from skindb.cli.terminal import bar
 from skindb.errors import few_names
-from skindb.parameters import EditParameters
+from skindb.parameters import DICTIONARY_HELP, EditParameters
 
 if TYPE_CHECKING:
     from xarray import DataTree
@@ -175,3 +182,30 @@ def _edit_notes(tree: DataTree) -> list[str]:
         *tree.attrs["trait_notes"],
         *skindb.analysis.describe_edit(tree.attrs["edit_report"]),
     ]
+
+
+@command
+@DB
+@click.option("--out", type=PATH, default="figures", help="Folder to write.")
+@click.option(
+    "--take",
+    help="Take of the figures of one face.  [default: one of the subject with the most conditions]",
+)
+@click.option("--dictionary", type=PATH, help=DICTIONARY_HELP)
+def reproduce(db: str, out: Path, take: str | None, dictionary: Path | None) -> None:
+    """Write the tables and figures of the paper: a page, figures.md, and its pictures.
+
+    What the takes do not allow is named on the page with the reason.
+    """
+    made = workflow.reproduce(
+        existing(db),
+        out,
+        take=take,
+        dictionary=dictionary,
+        progress=bar(),
+    )
+    lines = [f"{title}: {reason or 'made'}" for title, reason in made.items()]
+    emit(
+        {"page": str(out / "figures.md"), "made": made},
+        [*lines, str(out / "figures.md")],
+    )

@@ -4,7 +4,7 @@ without noise from the lights of its dome.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -56,6 +56,7 @@ def radiance_of(
     samples: int = 2,
     scale: float = 1.0,
     subsurface: bool = False,
+    terms: Collection[str] = TERMS,
 ) -> Float32:
     """Radiance (h, w, 3) that a camera of the dome of a model sees, without noise.
 
@@ -73,6 +74,8 @@ def radiance_of(
         Size of the picture relative to that of the camera.
     subsurface
         Whether diffuse light travels through the skin (dipole).
+    terms
+        Parts of the reflectance without subsurface light: "diffuse", "surface".
     """
     honour_consent(model.attrs, "export")
     dome = model["dome"].to_dataset().load()
@@ -82,19 +85,30 @@ def radiance_of(
     seen_by = chosen_camera(dome, camera)[0].scaled(scale)
     lamps = chosen_lights(dome, lights)[0]
     return sum_over_lights(
-        surface, lamps, seen_by, samples=samples, subsurface=subsurface
+        surface,
+        lamps,
+        seen_by,
+        samples=samples,
+        subsurface=subsurface,
+        terms=terms,
     )
 
 
 def sum_over_lights(
-    surface: Surface, lamps: Lights, camera: Camera, *, samples: int, subsurface: bool
+    surface: Surface,
+    lamps: Lights,
+    camera: Camera,
+    *,
+    samples: int,
+    subsurface: bool,
+    terms: Collection[str] = TERMS,
 ) -> Float32:
     """Linear picture (h, w, 3) under all lights. Irradiances are summed before light travels
     under the skin, as this is linear, and only visible surfels receive it.
     """
     scene = RayScene(surface.vertices, surface.faces)
     view = trace_view(surface, camera, samples=samples, scene=scene)
-    terms = ("surface",) if subsurface else TERMS
+    terms = ("surface",) if subsurface else terms
     direct = shade_view(view, surface, lamps, scene, terms=terms).sum(axis=0)
     if subsurface:
         received = transmitted_irradiance(surface, lamps, scene) @ lamps.intensity

@@ -36,6 +36,7 @@ from .fit import (
     takes_to_fit,
     takes_without_consent,
 )
+from .paper import reproduce
 from .pictures import (
     compare_take,
     explain_view,
@@ -109,6 +110,7 @@ __all__ = [
     "registered_datasets",
     "render_take",
     "repeat_requests",
+    "reproduce",
     "restore",
     "results_of",
     "show_take",

@@ -165,7 +165,8 @@ def basis_grid(
     dictionary: Path | None = None,
     **options: Any,
 ) -> dict[str, float]:
-    """Draw a face with k basis BRDFs and with all of the dictionary, with one exposure (figure 7).
+    """Draw a face, and what its surface reflects alone, with k basis BRDFs and with all of
+    the dictionary, with one exposure (figure 7).
 
     Parameters
     ----------
@@ -205,10 +206,13 @@ def basis_grid(
     options.setdefault("scale", _grid_scale(model))
     options["lights"] = lights or [_frontal_light(model)]
     pictures = {}
+    surfaces = []
     for name, mixture in mixtures.items():
         reduced_model = with_basis(model, mixture=mixture, names=names, tables=tables)
         pictures[name] = radiance_of(reduced_model, **options)
-    write_grid(out, {take: list(pictures.values())}, list(pictures))
+        surfaces.append(radiance_of(reduced_model, **options, terms=("surface",)))
+    rows = {take: [*pictures.values()], "surface alone": surfaces}
+    write_grid(out, rows, list(pictures))
     *_, full = pictures.values()
     return {
         name: _root_mean_square(picture - full) / _root_mean_square(full)

@@ -31,6 +31,7 @@ LOG_THEMSELVES = {
     "ingest_if_changed",
     "ingest_take",
     "record_consent",
+    "reproduce",
     "study",
     "tidy_table",
     "withdraw",

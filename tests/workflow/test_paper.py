@@ -1,0 +1,60 @@
+"""Tables and figures of the paper from a database."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from skindb import workflow
+from skindb.errors import InputError
+
+pytestmark = pytest.mark.slow
+
+
+def test_reproduce__writes_what_the_takes_allow_and_says_why_not(
+    fitted_database, tmp_path
+):
+    workflow.record_consent(fitted_database, "S02", ["fit", "statistics"])
+    reasons = workflow.reproduce(fitted_database, tmp_path)
+    page = (tmp_path / "figures.md").read_text()
+    assert page.startswith("# Tables")
+    assert "3 takes of 2 subjects; figures of one face are of S01." in page
+    for title, reason in reasons.items():
+        part = page.partition(f"## {title}\n")[2].partition("\n## ")[0]
+        assert "The paper: " in part
+        if reason:
+            assert f"Not made: {reason}" in part
+        else:
+            assert "Not made" not in part
+    made = {title.partition(":")[0] for title, reason in reasons.items() if not reason}
+    # the takes have neither photographs nor the whole dictionary
+    assert made == {"Table 1", "Table 2", "Figure 5", "Figure 6", "Figure 10"}
+    pictures = {path.name for path in tmp_path.glob("*.png")}
+    assert pictures == {"figure_5.png", "figure_6.png", "figure_10.png"}
+
+
+def test_reproduce__prints_the_means_and_variances_of_the_study(
+    fitted_database, tmp_path
+):
+    workflow.reproduce(fitted_database, tmp_path, take="S02")
+    page = (tmp_path / "figures.md").read_text()
+    table = workflow.translucency(fitted_database)["translucency_table"].isel(group=0)
+    rows = [
+        [cell.strip() for cell in line.split("|")[1:-1]]
+        for line in page.splitlines()
+        if line.startswith("| cheek |")
+    ]
+    for channel, row, published in zip(
+        "RGB", rows, (0.5572, 0.9751, 1.5494), strict=True
+    ):
+        at = table.sel(site="cheek", channel=channel)
+        assert int(row[2]) == at["sigma_tr_count"]
+        np.testing.assert_allclose(float(row[3]), at["sigma_tr_mean"], rtol=1e-3)
+        np.testing.assert_allclose(float(row[4]), at["sigma_tr_variance"], rtol=1e-3)
+        assert float(row[5]) == published
+
+
+def test_reproduce__refuses_a_take_without_a_model(fitted_database, tmp_path):
+    with pytest.raises(InputError, match="S09"):
+        workflow.reproduce(fitted_database, tmp_path / "out", take="S09")
+    assert not (tmp_path / "out").exists()
