@@ -56,7 +56,7 @@ def _fit(db, parameters=PARAMETERS, **options):
     ]
 
 
-def _kill(db, monkeypatch, parameters=PARAMETERS):
+def _kill(db, monkeypatch, parameters=PARAMETERS, **options):
     """Kill a fit at the start of its second pass."""
 
     def die(*_, **__):
@@ -65,7 +65,7 @@ def _kill(db, monkeypatch, parameters=PARAMETERS):
     with monkeypatch.context() as patch:
         patch.setattr(fit_module, "second_pass", die)
         with pytest.raises(Killed):
-            _fit(db, parameters)
+            _fit(db, parameters, **options)
     return db
 
 
@@ -115,10 +115,11 @@ def test_fit_take__continues_after_the_first_pass_of_a_killed_run(
 @pytest.mark.slow
 @pytest.mark.parametrize("change", ["parameters", "capture", "dictionary", "code"])
 def test_fit_take__uses_no_first_pass_that_would_be_another(
-    killed, change, change_code
+    killed, change, change_code, monkeypatch
 ):
     parameters = PARAMETERS
-    options = {}
+    stages = []
+    options = {"progress": lambda stage, *_: stages.append(stage)}
     if change == "parameters":
         parameters = replace(PARAMETERS, eta=1.31)
     elif change == "capture":
@@ -127,7 +128,7 @@ def test_fit_take__uses_no_first_pass_that_would_be_another(
         options["dictionary"] = None
     else:
         change_code("fit/normals.py", "return ", "return 1 and ")
-    _, stages = _fit(killed, parameters, **options)
+    _kill(killed, monkeypatch, parameters, **options)
     assert "first pass" in stages
 
 

@@ -261,8 +261,13 @@ def test_calibrate_rig__cameras_of_a_wrong_calibration_agree_in_later_captures(
     """A camera whose red is stated 15 % too low, with a white target in another one."""
     factor = 1.15
     folders = workflow.simulate(
-        tmp_path, takes=3, cameras=4, lights=16, width=64, height=80, seed=3
+        tmp_path, takes=3, cameras=4, lights=12, width=48, height=60, seed=3
     )
+    for folder in folders:
+        file = folder / "capture.json"
+        about = json.loads(file.read_text())
+        del about["contact"]
+        file.write_text(json.dumps(about))
     rig = Rig(Database(tmp_path / "db"), tmp_path)
     names = [folder.name for folder in folders]
 
