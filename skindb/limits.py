@@ -17,7 +17,7 @@ MAX_NAMED_UNKNOWN_KEYS = 20  # listed individually in a warning
 
 # of a record, manifest or table: a manifest lists about 9,000 files in 1 MB
 MAX_STORE_JSON_BYTES = 128 * MB
-# for which the scratch of a killed ingest or fit is kept, so that it can resume
+# for which the first pass of a killed fit is kept, so that it can resume
 RESUMABLE_SECONDS = 24 * 3600.0
 
 MAX_CAMERAS = 256

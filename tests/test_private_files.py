@@ -168,7 +168,6 @@ EXCEPTIONS = {
     "hw": "a session runs with a private umask",
     "virtual/laboratory.py": "a session runs with a private umask",
     "store": "a database has the permissions of its root",
-    "ingest/spool.py": "into the memory",
 }
 
 

@@ -2,7 +2,7 @@
 
 from skindb.format.folder import Capture, read_capture
 from skindb.geometry.scan import Crop
-from skindb.ingest.capture import ingest_capture, scratch_name
+from skindb.ingest.capture import ingest_capture
 from skindb.ingest.pictures import import_images, import_olat
 from skindb.ingest.report import (
     calibration_lines,
@@ -26,5 +26,4 @@ __all__ = [
     "read_capture",
     "sample_lines",
     "sample_table",
-    "scratch_name",
 ]

@@ -68,9 +68,7 @@ from skindb.ingest.relief import NO_SCAN_DEGREES, Relief, estimate_relief
 from skindb.ingest.report import (
     capture_provenance,
     describe_samples,
-    frame_marks,
     require_fit_consent,
-    samples_digest,
 )
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import (
@@ -108,9 +106,8 @@ def ingest_capture(
     parameters
         Default `IngestParameters()`.
     scratch
-        Folder in which the subfolder `scratch_name` holds the samples until they are
-        stored. A run after a killed one resumes from this subfolder; a run that ends
-        removes the subfolder and nothing else.
+        Folder on a disk with space for the samples; they are in a file without a name
+        until they are stored.
     progress
         Called with the stage, the number of finished steps and the total number of steps.
 
@@ -148,10 +145,12 @@ def ingest_capture(
         if capture.dome is None:
             run.groups["surfels"] = surfel_group(surfels, scan_error=capture.scan_error)
         else:
-            spool = stack.enter_context(run.spool(capture.dome, Path(scratch)))
+            dome = capture.dome
+            shape = (len(dome.lights), len(dome.cameras), len(surfels.position))
+            spool = stack.enter_context(Spool(Path(scratch), shape))
             # ends before the spool does
-            pool = stack.enter_context(ThreadPoolExecutor(threads(capture.dome)))
-            _DomeStages(run, capture.dome, spool, pool).sample()
+            pool = stack.enter_context(ThreadPoolExecutor(threads(dome)))
+            _DomeStages(run, dome, spool, pool).sample()
         # last, as the frames of the dome are checked only if nothing else is at fault
         run.measure_probe()
         run.require_no_faults()
@@ -214,15 +213,6 @@ class _Run:
             self.groups["probe"] = probe_group(probe, profiles, sites, isotropy)
             self.probe_notes = probe_notes(probe, profiles, isotropy)
 
-    def spool(self, dome: DomeRecord, scratch: Path) -> Spool:
-        """The spool of this capture and these parameters, new or left by a run that was
-        killed.
-        """
-        key = samples_digest(self.capture, asdict(self.parameters))
-        shape = (len(dome.lights), len(dome.cameras), len(self.surfels.position))
-        folder = scratch / _scratch_name(self.capture, key)
-        return Spool(folder, shape, frame_marks(dome), key=key)
-
     def require_no_faults(self) -> None:
         """Raise the faults of all stages, and of frames that are copies of others."""
         folder = self.capture.folder
@@ -275,16 +265,6 @@ def _copies(capture: Capture) -> list[Path]:
     return [*dark, *capture.probe.frame_files()]
 
 
-def scratch_name(capture: Capture, parameters: IngestParameters | None = None) -> str:
-    """Name of the scratch folder, unique to the capture and the parameters of its ingest."""
-    parameters = parameters or IngestParameters()
-    return _scratch_name(capture, samples_digest(capture, asdict(parameters)))
-
-
-def _scratch_name(capture: Capture, digest: str) -> str:
-    return f"{capture.take}-{digest[:16]}"
-
-
 def threads(dome: DomeRecord | None) -> int:
     """Number of threads that decode, trace and write: one per core, limited by memory;
     they release the GIL.
@@ -327,8 +307,6 @@ class _DomeStages:
         for merger in mergers.values():
             self.run.faults += dark_faults(self.dome, merger)
         intensity, measured = self._intensity(mergers)
-        # otherwise samples are those of other intensities, dark frames and cameras
-        self.spool.resumable = not self.run.faults
         scene = RayScene(surfels.position, surfels.faces)
         relief = self.run.relief
         if relief is None:
@@ -357,8 +335,7 @@ class _DomeStages:
             refined = self._refined(sampler)
             if refined is not self.dome:
                 rotations = applied_rotations(self.dome, refined)
-            self._require_cameras(rotations)
-            if refined is not self.dome:
+                self.spool.restart()
                 self.dome = refined
                 scene = RayScene(surfels.position, surfels.faces)
                 visible, clear, pixels = sees(refined.cameras, scene=scene)
@@ -413,14 +390,6 @@ class _DomeStages:
         dome, reason = choose_refinement(check, pictures, held_out)
         self._record(reason)
         return dome
-
-    def _require_cameras(self, rotations: Float64) -> None:
-        """Empty the spool unless its samples are those of cameras with these rotations."""
-        name = "rotations"
-        earlier = self.spool.kept(name)
-        if not np.array_equal(rotations, 0 * rotations if earlier is None else earlier):
-            self.spool.restart()
-            self.spool.keep(name, rotations)
 
     def _record(self, reason: str) -> None:
         """Record why the refinement was chosen or not."""

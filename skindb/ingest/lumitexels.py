@@ -180,7 +180,7 @@ class Sampler:
 
     def pictures(self, pairs: Collection[Pair]) -> dict[Pair, Float32]:
         """Downsampled photographs of these views, which are sampled unless they are in
-        the spool, also of an interrupted run.
+        the spool.
         """
         kept = self._kept(pairs, self._picture_name)
         missing = frozenset(pairs) - kept.keys()
@@ -190,8 +190,8 @@ class Sampler:
     def _kept(
         self, pairs: Iterable[Pair], name: Callable[[Pair], str]
     ) -> dict[Pair, Image]:
-        images = {pair: self.spool.kept(name(pair)) for pair in pairs}
-        return {pair: image for pair, image in images.items() if image is not None}
+        pictures = self.spool.pictures
+        return {pair: pictures[name(pair)] for pair in pairs if name(pair) in pictures}
 
     def _picture_name(self, pair: Pair) -> str:
         j, c = pair
@@ -282,9 +282,10 @@ class Sampler:
         if whole:
             radiance[flag == SATURATED] = np.nan
         if picture:
-            self.spool.keep(self._picture_name((j, c)), self.check.reduce(c, radiance))
+            name = self._picture_name((j, c))
+            self.spool.pictures[name] = self.check.reduce(c, radiance)
         if (j, c) in self.kept:
-            self.spool.keep(_photograph_name((j, c)), radiance)
+            self.spool.pictures[_photograph_name((j, c))] = radiance
         samples, outcome = self._gathered(merged, shot, surfels, j)
         count, lit, median, bright = view_levels(samples, outcome, MAX_SAMPLE)
         levels = self._levels

@@ -6,7 +6,6 @@ surfel, region, camera and light.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -15,7 +14,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb import __version__
 from skindb.errors import require
 from skindb.format.dome import DomeRecord
 from skindb.format.folder import WHOLE_SURFACE, Capture
@@ -93,21 +91,6 @@ def capture_provenance(
     }
 
 
-def samples_digest(capture: Capture, parameters: Mapping[str, Any]) -> str:
-    """Digest of everything that samples depend on except face frames; white and dark
-    frames enter by size and date.
-    """
-    dome = capture.dome
-    record = {
-        "version": __version__,
-        "parameters": _all_parameters(capture, parameters),
-        "rest": {} if dome is None else _marks(dome.frame_files("dark", "white")),
-        "files": _sha256(_files(capture)),
-    }
-    text = json.dumps(record, sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
 def _files(capture: Capture) -> list[Path]:
     """All files of a capture except frames."""
     cameras = () if capture.dome is None else capture.dome.cameras
@@ -123,19 +106,6 @@ def _all_parameters(capture: Capture, parameters: Mapping[str, Any]) -> dict[str
     if capture.calibrated_by:
         optional["calibrated_by"] = dict(capture.calibrated_by)
     return {**parameters, **optional}
-
-
-def frame_marks(dome: DomeRecord) -> dict[str, Any]:
-    """Size and date of the frames of the face by path, to detect changes."""
-    return _marks(dome.frame_files("frames"))
-
-
-def _marks(paths: Iterable[Path]) -> dict[str, Any]:
-    marks = {}
-    for path in paths:
-        status = path.stat()
-        marks[str(path)] = [status.st_size, status.st_mtime_ns]
-    return marks
 
 
 def _sha256(files: Iterable[Path]) -> str:

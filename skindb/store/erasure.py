@@ -52,10 +52,8 @@ FOLDERS_WITH_TAKES = ("log", "data", "heads", "leases")
 # results before their inputs, and all others last
 REMOVAL_ORDER = ("edit", STUDY, RELEASE, SUMMARY, "registration")
 REGISTRATION = "registration"
-# name of the scratch folder of an ingest, and of the first pass of a fit
+# name of the scratch folder of the first pass of a fit
 SCRATCH_NAME = re.compile(rf"({TAKE})-[0-9a-f]{{16}}")
-# end of the name of a scratch folder whose removal was interrupted
-ABANDONED_SCRATCH = ".gone"
 # start of the names of a version and of the files beside it
 STEM = re.compile(rf"({TIME_HEX})\.")
 Key = tuple[str, str, str]  # kind, take and seal of a version
@@ -75,7 +73,7 @@ class Holdings:
     unrecorded: tuple[str, ...] = ()
     damaged: tuple[str, ...] = ()  # keys of unreadable records of such versions
     requests: tuple[Request, ...] = ()
-    scratch: tuple[Path, ...] = ()  # folders of killed ingests on this machine
+    scratch: tuple[Path, ...] = ()  # first passes of killed fits on this machine
     caches: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
@@ -257,10 +255,8 @@ def _erase_holdings(
     place: Place, holdings: Holdings, markers: Markers, erasure: Erasure
 ) -> None:
     """Remove everything that was found, results after the requests to compute them again."""
-    for folder in _scratch(place):
-        # the name of one whose removal was interrupted does not tell whose data it holds
-        if folder in holdings.scratch or folder.name.endswith(ABANDONED_SCRATCH):
-            remove_tree(folder)
+    for folder in holdings.scratch:
+        remove_tree(folder)
     for (kind, take), number in holdings.takes.items():
         _erase_take(place, kind, take)
         erasure.removed += Counter({kind: number})

@@ -227,15 +227,13 @@ def _old_blocks(place: Place, now: Clock) -> list[Garbage]:
 
 
 def _scratch_folders(place: Place, now: Clock) -> Iterator[Garbage]:
-    """Scratch folders of killed ingests, and first passes of killed fits."""
+    """First passes of killed fits, and temporary files."""
     for name in place.children("tmp") if place.file_type("tmp") == "folder" else []:
         key = f"tmp/{name}"
         size = _bytes_below(place, key)
         if match := SCRATCH_NAME.fullmatch(name):
-            reason = (
-                _in_use_reason(place, "capture", match[1])
-                or _in_use_reason(place, "model", match[1])
-                or _recent_reason(place, [key], now, RESUMABLE_SECONDS)
+            reason = _in_use_reason(place, "model", match[1]) or _recent_reason(
+                place, [key], now, RESUMABLE_SECONDS
             )
         else:
             reason = _recent_reason(place, [key], now)

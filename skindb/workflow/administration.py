@@ -45,7 +45,7 @@ NOT_REACHED = (
     "exports, pages, pictures and notebooks that were made from the database",
     "backups that were not given to the command, which may still contain the subject",
     "snapshots of disks, and earlier versions of objects in a bucket that keeps them",
-    "scratch folders of interrupted ingests on other machines, until skindb clean runs there",
+    "first passes of interrupted fits on other machines, until skindb clean runs there",
     "blocks of a disk that were freed but not overwritten yet",
 )
 

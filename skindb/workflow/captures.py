@@ -2,7 +2,6 @@
 dated, versioned, and named by the captures that used them.
 """
 
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import asdict, replace
@@ -40,10 +39,8 @@ from skindb.ingest import (
     IngestParameters,
     ingest_capture,
     read_capture,
-    scratch_name,
 )
 from skindb.ingest.report import capture_provenance
-from skindb.ingest.spool import remove_stale
 from skindb.parameters import CalibrationParameters
 from skindb.schema import variables
 from skindb.schema.cohort import NORMAL, take_name, visit_of
@@ -138,14 +135,11 @@ def ingest_if_changed(
         stored = _unchanged(db, capture, record)
         if stored is not None:
             return stored, False
-    scratch = db.scratch() / scratch_name(capture, record)
     with logged_action(db, "ingest", [capture.take]):
-        remove_stale(scratch)
         try:
-            ingested = _ingest(db, capture, record, scratch, wait, progress, is_stated)
-            return ingested, True
+            return _ingest(db, capture, record, wait, progress, is_stated), True
         except (OSError, InputError):
-            _require_admitted(db, capture.take, scratch)
+            _require_admitted(db, capture.take)
             raise
 
 
@@ -226,7 +220,6 @@ def _ingest(
     db: Database,
     capture: Capture,
     parameters: IngestParameters,
-    scratch: Path,
     wait: float,
     progress: Progress,
     is_stated: bool,
@@ -234,17 +227,18 @@ def _ingest(
     lease = db.lease(
         capture.take, "capture", "model", wait=wait, command="skindb ingest"
     )
+    scratch = db.scratch()
     # what is read names its file; what the disk refuses is written there
     with add_filename(str(scratch)), lease:
         # what was recorded since counts, not the folder
         if db.has(CONSENT, subject_of(capture.take)):
             db.require_consent(capture.take, "fit")
         notes = _notes_on_visit(db, capture, is_stated=is_stated)
-        db.make_scratch(scratch.parent)
+        db.make_scratch(scratch)
         with (
             one_blas_thread(),
             ingest_capture(
-                capture, parameters, scratch=scratch.parent, progress=progress
+                capture, parameters, scratch=scratch, progress=progress
             ) as tree,
             db.stage("capture", capture.take, lease) as stage,
         ):
@@ -287,13 +281,10 @@ def _ingest_digest() -> str:
     )
 
 
-def _require_admitted(db: Database, take: str, scratch: Path) -> None:
-    """Raise a `WithdrawnError` and remove the scratch folder if the subject of a take
-    is withdrawn.
-    """
+def _require_admitted(db: Database, take: str) -> None:
+    """Raise a `WithdrawnError` if the subject of a take is withdrawn."""
     entry = db.withdrawal(subject_of(take))
     if entry is not None:
-        shutil.rmtree(scratch, ignore_errors=True)
         raise WithdrawnError(
             Fault(
                 subject_of(take),

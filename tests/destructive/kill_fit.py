@@ -44,7 +44,6 @@ from sphere import write_capture
 
 import skindb
 from skindb import workflow
-from skindb.ingest import spool
 from skindb.jit import reported_compilation
 from skindb.store import Database
 from skindb.store.stage import Stage
@@ -97,7 +96,6 @@ def ingest(db: Database, tell: Tell, work: Path) -> int:
     """Ingest the folder below the working folder, report each stage, and return the
     generation of the capture.
     """
-    spool.JOURNAL_INTERVAL_SECONDS = 0.0  # a small capture ends before the first entry
     ingest_module.ingest_capture = _telling(
         ingest_module.ingest_capture, INGEST[1], tell
     )

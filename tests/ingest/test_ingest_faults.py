@@ -83,7 +83,7 @@ def lumitexels_of(dome, surfels, folder):
     intensity = np.tile(INTENSITY, (len(dome.lights), 1))
     mergers = {camera.id: frame_merger(dome, camera) for camera in dome.cameras}
     shape = (len(dome.lights), len(dome.cameras), n)
-    with ThreadPoolExecutor(2) as pool, Spool(folder, shape, {}, key="run") as spool:
+    with ThreadPoolExecutor(2) as pool, Spool(folder, shape) as spool:
         share, clear, pixels = camera_visibility(
             surfels, dome.cameras, RayScene(surfels.position, surfels.faces), pool
         )

@@ -141,7 +141,7 @@ def sampled(dome, surfels, folder, *, lit=None):
     lit = np.ones((n, shape[0]), bool) if lit is None else lit
     with (
         ThreadPoolExecutor(2) as pool,
-        Spool(folder, (*shape, n), {}, key="run") as spool,
+        Spool(folder, (*shape, n)) as spool,
     ):
         _, clear, pixels = camera_visibility(
             surfels, dome.cameras, RayScene(surfels.position, surfels.faces), pool

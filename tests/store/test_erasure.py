@@ -247,7 +247,6 @@ def test_erase__scratch_folders_of_the_subject_alone(db):
     names = {
         "A-0123456789abcdef": False,
         "A.lotion-0123456789abcdef": False,
-        "00000000000000000000000000000000.gone": False,
         "AB-0123456789abcdef": True,
         "A-0123456789abcdef-0123456789abcdef": True,  # of a subject with this pseudonym
         "A-0123": True,
@@ -260,7 +259,7 @@ def test_erase__scratch_folders_of_the_subject_alone(db):
     assert {name: (db.root / "tmp" / name).exists() for name in names} == names
 
 
-def test_erase__only_scratch_of_a_killed_ingest(db):
+def test_erase__only_the_first_pass_of_a_killed_fit(db):
     _fitted(db, "B")
     scratch = db.root / "tmp" / "A-0123456789abcdef"
     scratch.mkdir(parents=True)

@@ -180,7 +180,7 @@ def test_clean__removes_temporary_files_of_killed_writers(db):
 
 
 def test_clean__keeps_the_scratch_of_an_ingest_for_a_day(db):
-    names = {"A1-0123456789abcdef": 23, "A1-123456789abcdef0": 25, f"{HEX}.gone": 2}
+    names = {"A1-0123456789abcdef": 23, "A1-123456789abcdef0": 25, f"{HEX}.new": 2}
     for name, hours in names.items():
         (db.root / "tmp" / name).mkdir(parents=True)
         (db.root / "tmp" / name / "samples").write_bytes(b"12345")
@@ -190,7 +190,7 @@ def test_clean__keeps_the_scratch_of_an_ingest_for_a_day(db):
         in _kept(db)["tmp/A1-0123456789abcdef"]
     )
     with db.lease("A1", "capture"):
-        assert [one.key for one in db.clean()] == [f"tmp/{HEX}.gone"]
+        assert [one.key for one in db.clean()] == [f"tmp/{HEX}.new"]
     removed = db.clean()
     assert [(one.key, one.bytes) for one in removed] == [("tmp/A1-123456789abcdef0", 5)]
     assert [path.name for path in (db.root / "tmp").iterdir()] == [
