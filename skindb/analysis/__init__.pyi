@@ -30,7 +30,6 @@ from .correlations import (
     plot_correlations,
 )
 from .coverage import coverage_report, describe_coverage, plot_coverage
-from .detail import transfer_detail
 from .edit import apply_traits, describe_edit
 from .formula_models import describe_model, linear_model, plot_model
 from .groups import (
@@ -144,6 +143,5 @@ __all__ = [
     "tidy",
     "trait_names",
     "trait_vectors",
-    "transfer_detail",
     "translucency_table",
 ]

@@ -122,7 +122,7 @@ def apply_traits(
     if variables.SIGMA_TR in fitted:
         fitted, reports["translucency"] = _moved_sigma_tr(fitted, amount, traits)
         tree = _with_moved_sites(tree, amount, traits)
-    tree["fitted"] = DataTree(surviving(fitted))
+    tree["fitted"] = DataTree(_surviving(fitted))
     tree.attrs = take_attrs(model.attrs) | {
         "edit": dict(amounts),
         "edit_distance": max(report["from_nearest"] for report in reports.values()),
@@ -236,7 +236,7 @@ def with_basis(
     tree = model.copy()
     weights = _projected(fitted, float64(mixture), brdf_metric(tables))
     tree["basis"] = DataTree(_common_basis(model, mixture, names, tables))
-    tree["fitted"] = DataTree(surviving(_with_weights(fitted, weights)))
+    tree["fitted"] = DataTree(_surviving(_with_weights(fitted, weights)))
     tree.attrs = take_attrs(model.attrs)
     return tree
 
@@ -288,25 +288,20 @@ def _moved_texture(
     return moved, report
 
 
-def with_albedo(fitted: Dataset, albedo: Array) -> Dataset:
-    """A fitted surface with new albedos (n, 3), limited to physical values."""
-    colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(float)
-    out = np.where(albedo == colour, colour, np.clip(albedo, DARKEST, BRIGHTEST))
-    s, _ = dipole_s(out, eta=float(fitted[variables.REFRACTIVE_INDEX]))
-    return fitted.assign(
-        diffuse_reflectance=label(variables.DIFFUSE_REFLECTANCE, out),
-        dipole_s=label(variables.DIPOLE_S, s),
-    )
-
-
 def _with_albedo(
     fitted: Dataset, target: Array, albedo: Dataset
 ) -> tuple[Dataset, Report]:
-    """The fitted surface with new albedos (n, 3), and the report of the change."""
-    moved = with_albedo(fitted, target)
+    """The fitted surface with new albedos (n, 3), limited to physical values, and the
+    report of the change.
+    """
     colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(float)
-    before = _mean(fitted, colour)
-    now = _mean(fitted, moved[variables.DIFFUSE_REFLECTANCE].values.astype(float))
+    out = np.where(target == colour, colour, np.clip(target, DARKEST, BRIGHTEST))
+    s, _ = dipole_s(out, eta=float(fitted[variables.REFRACTIVE_INDEX]))
+    moved = fitted.assign(
+        diffuse_reflectance=label(variables.DIFFUSE_REFLECTANCE, out),
+        dipole_s=label(variables.DIPOLE_S, s),
+    )
+    before, now = _mean(fitted, colour), _mean(fitted, out)
     takes = albedo[variables.ALBEDO_MEAN].sel(region=FACE).values
     axes = albedo[variables.COLOUR_AXIS].values
     # on the decorrelated axes, the unit is the standard deviation of skin in that direction
@@ -367,7 +362,7 @@ def _moved_sigma_tr(
     return fitted.assign(sigma_tr=label(variables.SIGMA_TR, np.exp(after))), report
 
 
-def surviving(ds: Dataset) -> Dataset:
+def _surviving(ds: Dataset) -> Dataset:
     """The variables that an edit changes or that stay valid; errors, residuals and
     weights belong to the unedited model.
     """
@@ -385,7 +380,7 @@ def _with_moved_sites(tree: DataTree, amount: Array, traits: Dataset) -> DataTre
         log, _ = _log_shift(amount, traits)
         scaled = sites[variables.SITE_SIGMA_TR].values.astype(float) * np.exp(log)
         moved = label(variables.SITE_SIGMA_TR, np.clip(scaled, *SIGMA_TR_RANGE))
-        kept = surviving(sites).drop_attrs(deep=False)
+        kept = _surviving(sites).drop_attrs(deep=False)
         tree["translucency"] = DataTree(kept.assign(site_sigma_tr=moved))
     return tree
 

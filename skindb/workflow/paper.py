@@ -407,7 +407,11 @@ ITEMS = (
         _people,
         "87 subjects, 70 male and 17 female, aged 13 to 74; one more in seven conditions.",
     ),
-    Item("Table 2: sigma_tr", _sigma_tr, "the last two columns."),
+    Item(
+        "Table 2: sigma_tr",
+        _sigma_tr,
+        "the last two columns; figure 17 shows that its variances are no variances.",
+    ),
     Item(
         "Figure 5: lumitexels",
         _lumitexels,
