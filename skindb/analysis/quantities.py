@@ -29,13 +29,6 @@ NORMAL_95 = 1.96
 RELATIVE = "fit_relative_reflectance"  # coordinate, 1 without a white target
 MIN_SUBJECTS = 3  # for a variance between or within subjects
 SURFACE = "surface reflectance"
-# noise of the mean surface reflectance of a region between takes, which the stated errors
-# of surfels omit: standard deviation about the regression on the truth, in 11 virtual
-# subjects of 4 cameras and 24 lights (0.0004 to 0.0006; 0.0019 to 0.0020 in HIDDEN);
-# docs/howto/population.md has the validation on another dome
-SURFACE_NOISE = 0.0006
-SURFACE_NOISE_HIDDEN = 0.002
-HIDDEN = ("nose", "lips", "neck")  # regions of which few lights show the highlight
 TYPOLOGY_ANGLE = "ITA"
 COLOUR_DIFFERENCE = "delta E"
 
@@ -239,8 +232,7 @@ def measurements(
 
     Errors of derived quantities are propagated to first order from those of R_d, which
     are independent between channels, and from the error of its level, which they share.
-    Those of surface reflectance are at least the noise between virtual subjects. Takes
-    without a white target have no colours, and R_d has the status "relative".
+    Takes without a white target have no colours, and R_d has the status "relative".
 
     Parameters
     ----------
@@ -292,12 +284,6 @@ def _measured(
         of_level = of_level + level.reshape(-1, *[1] * (values.ndim - 1))
     # what averaging over surfels does not remove: the level and the model of the fit
     model = np.nan_to_num(np.sqrt(np.maximum(total**2 - error**2 - of_level**2, 0)))
-    if quantity.name == SURFACE:
-        noise = [
-            SURFACE_NOISE_HIDDEN if region in HIDDEN else SURFACE_NOISE
-            for region in tables["region"].values.tolist()
-        ]
-        error = np.maximum(error, noise)
     if quantity.derive is not None:
         reflectance = values.copy()
         reflectance[relative] = np.nan

@@ -28,6 +28,13 @@ STREAM = 7  # random stream of the sample
 # constants and means of the group "basis" that studies of the dictionary need
 IN_TABLES = (variables.MEAN_DICTIONARY_WEIGHT, variables.DISC_ANGULAR_RADIUS)
 SIZE = 512  # texels along each side of the stored maps of a registration
+# degrees between the normal and a half vector, within which a surfel must be seen for its
+# surface reflectance to count: without the peak of its lobe it is a third too low, by an
+# amount that depends on the shape of the face. Chosen, as the patches, on 12 virtual
+# subjects of 4 cameras and 24 lights; docs/validation.md has two other domes
+MAX_HALF_ANGLE = 12.0
+# mm; errors of surface reflectance are independent between patches of this size only
+PATCH_SIZE = 20.0
 
 
 def sample_surfels(
@@ -121,10 +128,15 @@ def region_tables(fitted: Dataset, masks: Mapping[str, Mask]) -> Dataset:
         `region_surfels`, `region_area`, `region_diffuse_reflectance` with `_error`
         (from independent errors of the surfels) and `_total_error` (including the part
         that all surfels have in common, which averaging does not reduce),
-        `region_surface_reflectance` with its error. NaN for a region without trusted
-        surfels.
+        `region_surface_reflectance` with its error, of the surfels that were seen within
+        12 degrees of their highlight, unless there are none in the take; the error is
+        that of the scatter between patches of the region, which contains differences of
+        its skin, and at least that from independent errors. NaN for a region without
+        such surfels.
     """
     trusted = trusted_surfels(fitted)
+    cell = np.floor(fitted[variables.SURFEL_POSITION].values / PATCH_SIZE)
+    patch = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
     area = fitted[variables.SURFEL_AREA].values.astype(float)
     colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(float)
     noise, total, shine, shine_error = (
@@ -136,6 +148,9 @@ def region_tables(fitted: Dataset, masks: Mapping[str, Mask]) -> Dataset:
             (variables.SURFACE_REFLECTANCE_ERROR, area.shape),
         )
     )
+    if variables.SMALLEST_HALF_ANGLE in fitted:
+        near = fitted[variables.SMALLEST_HALF_ANGLE].values <= MAX_HALF_ANGLE
+        shine[~near & (trusted & near).any()] = np.nan
     # model errors of neighbouring surfels are correlated: averaging does not reduce them
     model_error = np.sqrt(np.maximum(total**2 - noise**2, 0))
     tables: dict[str, list[Any]] = {}
@@ -145,6 +160,7 @@ def region_tables(fitted: Dataset, masks: Mapping[str, Mask]) -> Dataset:
         mean, error = _weighted_mean(colour[inside], noise[inside], weight)
         common, _ = _weighted_mean(model_error[inside], model_error[inside], weight)
         gloss, gloss_error = _weighted_mean(shine[inside], shine_error[inside], weight)
+        scatter = _patch_error(shine[inside] - gloss, weight, patch[inside])
         for name, value in (
             (variables.REGION_SURFELS, inside.sum()),
             (variables.REGION_AREA, weight.sum()),
@@ -152,7 +168,10 @@ def region_tables(fitted: Dataset, masks: Mapping[str, Mask]) -> Dataset:
             (variables.REGION_DIFFUSE_REFLECTANCE_ERROR, error),
             (variables.REGION_DIFFUSE_REFLECTANCE_TOTAL_ERROR, np.hypot(error, common)),
             (variables.REGION_SURFACE_REFLECTANCE, gloss),
-            (variables.REGION_SURFACE_REFLECTANCE_ERROR, gloss_error),
+            (
+                variables.REGION_SURFACE_REFLECTANCE_ERROR,
+                np.fmax(gloss_error, scatter),
+            ),
         ):
             tables.setdefault(name, []).append(value)
     return dataset(
@@ -174,6 +193,19 @@ def trusted_surfels(fitted: Dataset) -> Mask:
         enough = fitted[variables.FIT_SAMPLES].values >= MIN_SAMPLES_TRUSTED
         good &= enough | ~(good & enough).any()
     return np.asarray(good & finite_rows(fitted[variables.DIFFUSE_REFLECTANCE].values))
+
+
+def _patch_error(residual: Array, weight: Array, patch: Index) -> float:
+    """Standard error of a weighted mean from residuals that are independent between
+    patches only; NaN for fewer than two patches.
+    """
+    is_known = np.isfinite(residual)
+    count = len(np.unique(patch[is_known]))
+    if count < 2:
+        return np.nan
+    sums = np.bincount(patch[is_known], (weight * residual)[is_known])
+    square = (sums**2).sum() * count / (count - 1)
+    return float(np.sqrt(square) / weight[is_known].sum())
 
 
 def no_surfels_error(model: DataTree) -> InputError:

@@ -379,9 +379,10 @@ REGION_DIFFUSE_REFLECTANCE_TOTAL_ERROR = declare(
 )
 REGION_SURFACE_REFLECTANCE = declare(
     "float64 tables/region_surface_reflectance(region) [1]",
-    "area-weighted mean of surface_reflectance over the trusted surfels of the region",
+    "area-weighted mean of surface_reflectance over the trusted surfels of the region that "
+    "were seen near their highlight",
 )
 REGION_SURFACE_REFLECTANCE_ERROR = declare(
     "float64 tables/region_surface_reflectance_error(region) [1]",
-    "standard error of the mean from the independent errors of its surfels",
+    "standard error of the mean, from its scatter between patches of the region",
 )

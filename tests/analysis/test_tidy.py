@@ -17,8 +17,6 @@ from skindb.analysis.colour import typology_angle, typology_class
 from skindb.analysis.quantities import (
     DERIVED,
     QUANTITIES,
-    SURFACE_NOISE,
-    SURFACE_NOISE_HIDDEN,
     measurements,
 )
 from skindb.cli import cli
@@ -156,14 +154,6 @@ def test_tidy__columns(cohort):
     )
     surface = frame[frame.quantity == "surface reflectance"]
     assert surface.error.isna().all()  # none is stated
-    named = cohort.assign_coords(region=["face", "nose"])
-    stated = named.assign(
-        region_surface_reflectance_error=named["region_surface_reflectance"] * 0
-    )
-    assert [*tidy(stated).query("quantity == 'surface reflectance'").error[:2]] == [
-        SURFACE_NOISE,
-        SURFACE_NOISE_HIDDEN,
-    ]
     units = {name: set(part.unit) for name, part in frame.groupby("quantity")}
     assert units["ITA"] == {"degree"}
     assert units["sigma_tr"] == {"mm-1"}
