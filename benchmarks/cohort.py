@@ -1,15 +1,21 @@
-"""Results of the studies of a simulated cohort, compared with the truth of its subjects.
+"""Every quantity of the studies of a simulated cohort, compared with the truth of its
+subjects.
 
     skindb simulate captures --cohort 87 --workers 2
     skindb ingest db captures/*/ --workers 2 && skindb fit db --workers 2
     python -m benchmarks cohort captures db [--group-by gender] [--adjust age]
 
-For every quantity that `analyze groups` compares and whose truth is known (R_d of
-regions, sigma_tr of sites), the table has the mean over subjects and its truth, the
-difference between groups and its truth (the same regression of the true values), and
-whether the stated 95 % interval of the difference contains that truth. It should nearly
-always do so, because the interval also covers the variation between subjects, which the
-true values share.
+The first table has for every quantity, over its regions or sites and channels, in takes of
+the condition normal: the bias;
+the standard deviation of its errors over takes, beside the one that is stated; how often
+the stated 95 % intervals contain the truth, with the errors that takes have in common and
+without these and the bias; the correlation with the truth; the true reliability, 1 less
+the variance of the errors over that of the values, beside the stated one; and how often
+`analyze groups` has p < 0.05 for a factor that is drawn at random. The second table has
+the regions of surface reflectance. The last ones have the differences of groups, their
+truth (the same regression of the true values), and whether their 95 % intervals contain
+it: nearly always, as they also cover the variation between subjects, which the true
+values share.
 """
 
 from __future__ import annotations
@@ -22,8 +28,22 @@ import xarray as xr
 
 import skindb
 from skindb.analysis import group_effects
+from skindb.analysis.quantities import (
+    NORMAL_95,
+    QUANTITIES,
+    SURFACE,
+    Measurement,
+    measurements,
+    quantities_of,
+)
+from skindb.analysis.subjects import NORMAL
+from skindb.virtual.capture import _materials
 
-CHANNELS = ("R", "G", "B")
+NAMES = tuple(QUANTITIES)
+HEADER = (
+    "bias | deviation | stated | covered | without bias | correlation | reliability | "
+    "stated |"
+)
 
 
 def truth_of(path: Path, cohort: xr.Dataset) -> xr.Dataset:
@@ -31,27 +51,96 @@ def truth_of(path: Path, cohort: xr.Dataset) -> xr.Dataset:
     held = np.load(path)
     names = held["region_names"].tolist()
     sites = held["site_names"].tolist()
-    regions = np.full((cohort.sizes["region"], 3), np.nan)
+    surface = held["surface_weights"] @ _materials()[1]
+    # the even part of the materials is diffuse light for every fit
+    even = held["surface_lambertian"]
+    skin = np.column_stack([held["diffuse_reflectance"], surface - even])
+    regions = np.full((cohort.sizes["region"], 4), np.nan)
     for i, name in enumerate(cohort["region"].values.tolist()):
-        inside = np.ones(len(held["vertices"]), bool) if name == "face" else None
+        inside = np.full(len(skin), name == "face")
         if name in names:
             inside = held["region_membership"][:, names.index(name)] > 0.5
-        if inside is not None and inside.any():
-            regions[i] = held["diffuse_reflectance"][inside].mean(axis=0)
+        if inside.any():
+            regions[i] = skin[inside].mean(axis=0)
     probed = np.full((cohort.sizes["site"], 3), np.nan)
     for i, name in enumerate(cohort["site"].values.tolist()):
         if name in sites:
             probed[i] = held["site_sigma_tr"][sites.index(name)]
     return xr.Dataset(
         {
-            "region_diffuse_reflectance": (("region", "channel"), regions),
+            "region_diffuse_reflectance": (("region", "channel"), regions[:, :3]),
+            "region_surface_reflectance": (("region",), regions[:, 3]),
             "site_sigma_tr": (("site", "channel"), probed),
         }
     )
 
 
+def compared(estimated: Measurement, true: Measurement, places: np.ndarray) -> str:
+    """Columns of `HEADER` for the values of some places (mask)."""
+
+    def chosen(values: np.ndarray) -> np.ndarray:
+        return values.reshape(len(values), -1)[:, places.ravel()]
+
+    value, truth = chosen(estimated.values), chosen(true.values)
+    stated, common = chosen(estimated.errors), chosen(estimated.common)
+    if estimated.quantity.is_log:
+        stated = stated / value
+        common = common / value
+        value, truth = np.log(value), np.log(truth)
+    error = np.where(np.isfinite(stated), value - truth, np.nan)
+    bias = np.nanmean(error, axis=0)
+    scatter = np.nanvar(error, axis=0, ddof=1)
+    variance = np.nanvar(np.where(np.isfinite(error), value, np.nan), axis=0, ddof=1)
+    squares = np.nanmean(stated**2, axis=0)
+
+    def covered(difference: np.ndarray, deviation: np.ndarray) -> str:
+        inside = np.abs(difference) < NORMAL_95 * deviation
+        return f"{100 * inside[np.isfinite(difference)].mean():.0f} %"
+
+    correlation = [
+        np.corrcoef(*pair[:, np.isfinite(pair).all(axis=0)])[0, 1]
+        for pair in np.stack([value, truth], axis=1).transpose(2, 1, 0)
+    ]
+    numbers = (
+        f"{np.nanmean(bias):.4f}",
+        f"{np.sqrt(np.nanmean(scatter)):.4f}",
+        f"{np.sqrt(np.nanmean(squares)):.4f}",
+        covered(error, np.hypot(stated, np.nan_to_num(common))),
+        covered(error - bias, stated),
+        f"{np.nanmedian(correlation):.2f}",
+        f"{np.nanmedian(np.maximum(1 - scatter / variance, 0)):.2f}",
+        f"{np.nanmedian(np.maximum(1 - squares / variance, 0)):.2f}",
+    )
+    return " | ".join(numbers)
+
+
+def false_positives(cohort: xr.Dataset, draws: int) -> dict[str, str]:
+    """Quantity -> fraction of p < 0.05 for groups that are drawn, of those with a p."""
+    rng = np.random.default_rng(3)
+    subjects, index = np.unique(cohort["subject"].values, return_inverse=True)
+    found: dict[str, list[np.ndarray]] = {name: [] for name in NAMES}
+    for _ in range(draws):
+        half = rng.permutation(np.arange(len(subjects)) % 2)[index]
+        drawn = cohort.assign_coords(drawn=("take", np.array(["a", "b"])[half]))
+        effects = group_effects(
+            drawn, group_by="drawn", quantities=NAMES, permutations=199, rng=rng
+        ).isel(contrast=0)
+        labels = np.array(effects["quantity"].values.tolist())
+        for name, p in found.items():
+            p.append(effects["effect_p"].values[np.char.startswith(labels, f"{name} ")])
+    return {
+        name: f"{100 * np.nanmean(np.less(p, 0.05)[np.isfinite(p)]):.1f} %"
+        for name, p in found.items()
+    }
+
+
 def main(
-    captures: Path, db: str, *, group_by: str = "gender", adjust: Sequence[str] = ()
+    captures: Path,
+    db: str,
+    *,
+    group_by: str = "gender",
+    adjust: Sequence[str] = (),
+    draws: int = 100,
 ) -> None:
     """Compare and print."""
     cohort = skindb.open(db).cohort("tables").load()
@@ -60,59 +149,55 @@ def main(
         for take in cohort["take"].values.tolist()
     ]
     planted = xr.concat(true, "take").assign_coords(cohort.coords)
-    measured = [
-        name
-        for name in ("region_diffuse_reflectance", "site_sigma_tr")
-        if name in cohort
-    ]
     # restrict the truth to where estimates exist
-    compared = {
-        name: planted[name].where(np.isfinite(cohort[name])) for name in measured
-    }
     planted = cohort.drop_vars(
         [name for name in cohort if str(name).endswith("_error")]
-    ).assign(compared)
-    options = {"group_by": group_by, "adjust": adjust, "permutations": 1000}
-    estimated, want = (
-        group_effects(cohort_part, rng=np.random.default_rng(0), **options)
-        for cohort_part in (cohort, planted)
+    ).assign(
+        {
+            name: planted[name].where(np.isfinite(cohort[name]))
+            for name in planted
+            if name in cohort
+        }
     )
+    normal = np.flatnonzero(cohort["condition"] == NORMAL)
+    false = false_positives(cohort.isel(take=normal), draws)
+    print(f"| quantity | {HEADER} p < 0.05 |")
+    both = [measurements(part.isel(take=normal)) for part in (cohort, planted)]
+    for estimated, truth in zip(*both, strict=True):
+        name = estimated.quantity.name
+        everywhere = np.ones(estimated.values.shape[1:], bool)
+        print(f"| {name} | {compared(estimated, truth, everywhere)} | {false[name]} |")
+        if name == SURFACE:
+            surface = (estimated, truth)
+    print(f"\n| {SURFACE} | {HEADER}")
+    regions = surface[0].labels[0]
+    for region in regions:
+        print(f"| {region} | {compared(*surface, np.array(regions) == region)} |")
+    options = {"group_by": group_by, "adjust": adjust, "quantities": NAMES}
+    estimated, want = (
+        group_effects(part, permutations=1000, rng=np.random.default_rng(0), **options)
+        for part in (cohort, planted)
+    )
+    print_differences(estimated, want, quantities_of(cohort, NAMES).names)
+
+
+def print_differences(
+    estimated: xr.Dataset, want: xr.Dataset, quantities: Sequence[str]
+) -> None:
+    """Differences of groups, and which intervals contain the true ones."""
     for contrast in estimated["contrast"].values.tolist():
         inside = []
         print(
-            f"| {contrast} | true mean | mean | true difference | difference | 95 "
-            "% interval | contains the truth |"
+            f"\n| {contrast} | true difference | difference | 95 % interval | holds it |"
         )
-        for quantity in estimated["quantity"].values.tolist():
-            if quantity.startswith("surface"):
-                continue
+        for quantity in quantities:
             est = estimated.sel(contrast=contrast, quantity=quantity)
-            true_effect = want.sel(contrast=contrast)
-            truth = float(true_effect["effect"].sel(quantity=quantity))
+            truth = float(want["effect"].sel(contrast=contrast, quantity=quantity))
             low = float(est["effect_low"])
             high = float(est["effect_high"])
             inside.append(low <= truth <= high)
-            means = [_mean(cohort_part, quantity) for cohort_part in (planted, cohort)]
-            numbers = f"{means[0]:.3f} | {means[1]:.3f} | {truth:.4f} | {float(est['effect']):.4f}"
             print(
-                f"| {quantity} | {numbers} | {low:.4f} to {high:.4f} | "
-                f"{'yes' if inside[-1] else 'no'} |"
+                f"| {quantity} | {truth:.4f} | {float(est['effect']):.4f} | {low:.4f} to "
+                f"{high:.4f} | {'yes' if inside[-1] else 'no'} |"
             )
         print(f"{sum(inside)} of {len(inside)} intervals contain the truth")
-
-
-def _mean(cohort: xr.Dataset, quantity: str) -> float:
-    """Mean over takes of the quantity with this name."""
-    prefix, place, channel = quantity.rsplit(" ", 2)
-    variable, dim = {
-        "R_d": ("region_diffuse_reflectance", "region"),
-        "sigma_tr": ("site_sigma_tr", "site"),
-    }[prefix]
-    labels = (
-        cohort["channel"].values.tolist()
-        if "channel" in cohort.coords
-        else list(CHANNELS)
-    )
-    return float(
-        cohort[variable].sel({dim: place}).isel(channel=labels.index(channel)).mean()
-    )
