@@ -649,13 +649,13 @@ def test_declarations__are_those_of_the_studies():
 
 
 @pytest.mark.slow
-def test_import__of_methods_needs_no_plots_and_no_colour_science():
+def test_import__of_methods_needs_no_plots_no_colour_science_and_no_learning():
     """Every process of a run imports the methods, and these packages would double the
     time for that.
     """
     code = (
-        "import sys, skindb.analysis, skindb.fit, skindb.ingest; print({'colour', "
-        "'matplotlib'} & set(sys.modules))"
+        "import sys, skindb.analysis, skindb.fit, skindb.ingest, skindb.render.rendering; "
+        "print({'colour', 'matplotlib', 'sklearn'} & set(sys.modules))"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True

@@ -10,8 +10,6 @@ from dataclasses import dataclass, fields
 from functools import partial
 
 import numpy as np
-from sklearn.decomposition import NMF
-from sklearn.exceptions import ConvergenceWarning
 
 from skindb.numerics.nnls import solve_nnls
 from skindb.threads import c_contiguous
@@ -75,6 +73,9 @@ def nmf(
         )
     if not X.any():
         return Factorisation(np.full((k, X.shape[1]), 1.0 / X.shape[1]), 0.0, 0.0)
+    # takes as long to import as all that a picture needs, which has no factors
+    from sklearn.exceptions import ConvergenceWarning
+
     A = None if metric is None else (metric + metric.T) / 2
     starts = [None, *(int(rng.integers(2**31)) for _ in range(seeds))]
     # around all starts, because filters apply to the process, not to a thread
@@ -105,6 +106,8 @@ def _in_coefficients(X: Array, k: int, seed: int | None) -> tuple[Array, Array]:
     """W and H that minimise |X - W H|, started from singular vectors, or at random if a
     seed is given.
     """
+    from sklearn.decomposition import NMF  # as above
+
     # single precision is three times faster, and its rounding is far below the error
     level = X.mean()
     scaled = (X / level).astype(np.float32)
