@@ -34,6 +34,7 @@ LONGEST = {
     "test_hostile_disc",
     "test_cli",
     "test_bucket",
+    "test_withdraw",
 }
 
 

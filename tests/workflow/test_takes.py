@@ -19,23 +19,17 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 from waiting import wait_until
 
+# the processes of takes import this module: nothing large
 import skindb
-from skindb.analysis import principal_components
+from skindb import workflow
 from skindb.errors import Fault, InputError
-from skindb.workflow import (
-    albedo,
-    brdf,
+from skindb.workflow.takes import (
     computing_on,
     connected,
-    fit_with,
-    ingest_take,
+    faults_of,
     map_takes,
-    register_takes,
     results_of,
-    simulate,
-    traits,
 )
-from skindb.workflow.takes import faults_of
 
 FAULT = Fault("a.exr", "must be readable", "nothing", "write it again")
 pytestmark = pytest.mark.slow
@@ -317,7 +311,7 @@ def _several_blas_threads():
 
 @pytest.fixture(scope="module")
 def captures(tmp_path_factory):
-    return simulate(tmp_path_factory.mktemp("captures"), **SMALL)
+    return workflow.simulate(tmp_path_factory.mktemp("captures"), **SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -332,23 +326,31 @@ def address():
         yield cluster.scheduler_address
 
 
-def _filled(root, captures, **where):
+@pytest.fixture(scope="module")
+def dictionary(tmp_path_factory, small_dictionary):
+    """File of six materials, of which fits and studies take less time."""
+    from skindb.reflectance.brdf_files import write_tables
+
+    path = tmp_path_factory.mktemp("dictionary") / "six.npz"
+    write_tables(path, small_dictionary)
+    return path
+
+
+def _filled(root, captures, dictionary, **where):
     """A database of captures, models and registrations."""
     db = skindb.open(str(root))
-    list(
-        results_of(
-            map_takes(partial(ingest_take, db, spacing_mm=6.0), captures, **where)
-        )
-    )
+    ingest = partial(workflow.ingest_take, db, spacing_mm=6.0)
+    list(results_of(map_takes(ingest, captures, **where)))
     takes = db.takes("capture")[:: -1 if "client" in where else 1]
-    list(results_of(map_takes(partial(fit_with, db, changes=GIVEN), takes, **where)))
-    register_takes(db, **where)
+    fit = partial(workflow.fit_with, db, changes=GIVEN, dictionary=dictionary)
+    list(results_of(map_takes(fit, takes, **where)))
+    workflow.register_takes(db, **where)
     if "workers" in where:  # studies are computed in this process or on a cluster
         return db
     with computing_on(where.get("client"), db.root):
-        brdf(db)
-        traits(db, k=3)
-        albedo(db, group_by="gender")
+        workflow.brdf(db, dictionary=dictionary)
+        workflow.traits(db, k=3, dictionary=dictionary)
+        workflow.albedo(db, group_by="gender")
     return db
 
 
@@ -387,20 +389,22 @@ def _contents(db):
 
 @pytest.mark.slow
 def test_map_takes__the_same_bytes_on_every_engine_and_in_any_order(
-    captures, address, tmp_path, small_textures
+    captures, dictionary, address, tmp_path, small_textures
 ):
-    expected = _contents(_filled(tmp_path / "here", captures))
+    expected = _contents(_filled(tmp_path / "here", captures, dictionary))
     assert len(expected) == 11  # two takes of four kinds, three studies
     assert min(len(digests) for digests, *_ in expected.values()) > 5
-    by_processes = _contents(_filled(tmp_path / "processes", captures, workers=2))
+    by_processes = _contents(
+        _filled(tmp_path / "processes", captures, dictionary, workers=2)
+    )
     assert by_processes == {key: expected[key] for key in by_processes}
     assert len(by_processes) == 6
     faces = skindb.open(str(tmp_path / "here")).cohort("maps").texel_diffuse_reflectance
-    whole = principal_components(faces)
+    whole = skindb.analysis.principal_components(faces)
     with connected(address) as client:
         with computing_on(client):
-            assert principal_components(faces).equals(whole)
-        assert (
-            _contents(_filled(tmp_path / "cluster", captures[::-1], client=client))
-            == expected
+            assert skindb.analysis.principal_components(faces).equals(whole)
+        cluster = _filled(
+            tmp_path / "cluster", captures[::-1], dictionary, client=client
         )
+        assert _contents(cluster) == expected
