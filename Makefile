@@ -53,7 +53,8 @@ docs: $(STAMP)
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if v >= (3, 11) else f"skindb needs Python 3.11 or later; {sys.executable} is {v[0]}.{v[1]}; call: make PYTHON=/path/to/python3.11")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	-$(BIN)/python -W ignore -m compileall -qq --workers 0 $(VENV)/lib  # pip would use one processor
 	$(BIN)/python -c 'from skindb.fit import compile_kernels; compile_kernels()'
 	touch $@
 
