@@ -225,7 +225,7 @@ class _Run:
         """Provenance and summary of the version."""
         spacing = self.surfels.spacing()
         notes = [*self.notes]
-        if self.parameters.spacing_mm > 1.5 * spacing:
+        if self.relief is None and self.parameters.spacing_mm > 1.5 * spacing:
             notes.append(
                 f"the points of the scan are {spacing:.2g} mm apart; a wider spacing leaves "
                 "the scan unchanged"

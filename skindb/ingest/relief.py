@@ -149,7 +149,7 @@ def estimate_relief(
         len(faces) > 0,
         f"{dome.file}[frames]",
         "neighbouring pixels must be lit by three lights to form a surface",
-        f"{known.sum():,} pixels without such neighbours",
+        "only pixels without such neighbours",
         "photograph the subject larger, or with more lights",
     )
     surface = clean_mesh(vertices, faces)

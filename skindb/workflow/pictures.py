@@ -201,7 +201,7 @@ def translucency_grid(
     out: Path,
     *,
     site: str = "cheek",
-    samples: int = 64,
+    samples: int = 16,
     progress: Progress = silent,
 ) -> dict[str, float]:
     """Draw the takes with the shortest and the longest diffusion length at a site, with
