@@ -306,25 +306,13 @@ def small_database(tmp_path_factory):
     """A database with a simulated take that was fitted by the command line."""
     out = tmp_path_factory.mktemp("cli")
     db = str(out / "db")
-    made = _run(
-        "simulate",
-        str(out / "c"),
-        "--takes",
-        "1",
-        "--cameras",
-        "4",
-        "--lights",
-        "16",
-        "--width",
-        "64",
-        "--height",
-        "80",
-    )
+    size = "--takes 1 --cameras 3 --lights 12 --width 48 --height 60".split()
+    made = _run("simulate", str(out / "c"), *size)
     assert made.returncode == 0, made.stderr
-    taken = _run("ingest", db, str(out / "c/V001"), "--spacing", "4")
+    taken = _run("ingest", db, str(out / "c/V001"), "--spacing", "6")
     assert taken.returncode == 0
     assert re.search(
-        r"samples per surfel: mean \d+ \(p5 \d+, .* of 64; \d+% of [\d,]+ surfels have any",
+        r"samples per surfel: mean \d+ \(p5 \d+, .* of 36; \d+% of [\d,]+ surfels have any",
         taken.stdout,
     )
     [chosen] = re.findall(r"^ +chosen: refine o(?:n|ff).*$", taken.stdout, re.M)

@@ -25,7 +25,7 @@ def _done(*args):
 def test_cli__all_steps_work_in_a_bucket(new_database, tmp_path, monkeypatch):
     url = new_database("moto")
     monkeypatch.setenv("SKINDB_CACHE", str(own_cache(tmp_path / "cache")))
-    size = ("--cameras", 4, "--lights", 16, "--width", 64, "--height", 80)
+    size = ("--cameras", 3, "--lights", 12, "--width", 48, "--height", 60)
     _done("simulate", tmp_path / "c", "--takes", 1, *size)
     _done("ingest", url, tmp_path / "c/V001", "--spacing", 8)
     assert not [
