@@ -20,7 +20,7 @@ from numba.extending import intrinsic, overload
 from numpy.typing import NDArray
 
 from skindb.kernel_compiler import Kernel
-from skindb.types import IntVector32, Matrix32, Vector, Vector32
+from skindb.types import Matrix32, Vector, Vector32
 
 # a kernel keeps its signature for mypy, which checks its callers
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -340,20 +340,20 @@ WINDOW = np.int32(256)  # units in the last place: a relative 3e-5
 
 
 @kernel
-def median_of(values: Vector32, bits: IntVector32, n: int, count: int) -> float:
+def median_of(values: Vector32, n: int, count: int) -> float:
     """Median of n non-negative float32 of which `count` are finite and the others inf,
     to a relative error of 3e-5.
 
-    `bits` is the same memory as int32. The bits are bisected by counting; values within
-    WINDOW count as equal.
+    Their bits are bisected by counting; values within WINDOW count as equal.
     """
     if count == 0:
         return 0.0
     low = INFINITE
     high = np.int32(0)
     for i in range(n):
-        low = min(low, bits[i])
-        high = max(high, bits[i] if bits[i] < INFINITE else np.int32(0))
+        bits = float_bits(values[i])
+        low = min(low, bits)
+        high = max(high, bits if bits < INFINITE else np.int32(0))
     k = np.int32((count - 1) // 2)
     low = np.int32(low - 1)
     # at most k values are below or at `low`, more than k below or at `high`
@@ -361,7 +361,7 @@ def median_of(values: Vector32, bits: IntVector32, n: int, count: int) -> float:
         middle = np.int32(low + (high - low) // 2)
         below = np.int32(0)
         for i in range(n):
-            below += np.int32(bits[i] <= middle)
+            below += np.int32(float_bits(values[i]) <= middle)
         if below > k:
             high = middle
         else:
@@ -370,9 +370,10 @@ def median_of(values: Vector32, bits: IntVector32, n: int, count: int) -> float:
     lower = np.float32(np.inf)
     upper = np.float32(np.inf)
     for i in range(n):
-        below += np.int32(bits[i] <= high)
-        lower = min(lower, values[i] if bits[i] > low else np.float32(np.inf))
-        upper = min(upper, values[i] if bits[i] > high else np.float32(np.inf))
+        bits = float_bits(values[i])
+        below += np.int32(bits <= high)
+        lower = min(lower, values[i] if bits > low else np.float32(np.inf))
+        upper = min(upper, values[i] if bits > high else np.float32(np.inf))
     if count % 2 or below > k + 1:
         upper = lower
     return 0.5 * (np.float64(lower) + np.float64(upper))

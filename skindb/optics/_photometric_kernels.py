@@ -27,7 +27,6 @@ from skindb.types import (
     Cube,
     Cube32,
     IntVector,
-    IntVector32,
     Matrix,
     Matrix32,
     Real,
@@ -88,7 +87,6 @@ class Buffers(NamedTuple):
     passed: Vector32  # (lights,) F_t of the light
     residual: Vector32  # (lights,)
     size: Vector32  # (lights,) absolute values of the residuals
-    size_bits: IntVector32  # the same memory as int32
     score: Matrix  # (2, lights)
     turn: Cube  # (2, 3, 3) from a sum of score times direction to a rotation
 
@@ -109,7 +107,6 @@ def normal_estimates() -> NormalEstimates:
 def buffers(lights: int, cameras: int) -> Buffers:
     """Memory for `estimate_normal`."""
     single = np.zeros((10 + 2 * cameras, lights), np.float32)
-    size = single[9]
     return Buffers(
         np.empty(lights * cameras * 3, np.float32),
         single[0:3],
@@ -123,8 +120,7 @@ def buffers(lights: int, cameras: int) -> Buffers:
         single[6],
         single[7],
         single[8],
-        size,
-        size.view(np.int32),
+        single[9],
         np.zeros((2, lights)),
         np.empty((2, 3, 3)),
     )
@@ -414,7 +410,7 @@ def _photometric(
             moved += (g[k] / size - normal[k]) ** 2
             normal[k] = g[k] / size
         _residuals(g, shade, b)
-        middle = median_of(b.size, b.size_bits, b.size.shape[0], count)
+        middle = median_of(b.size, b.size.shape[0], count)
         spread = 1.4826 * middle + 0.01 * size
         if moved < MIN_SQUARED_CHANGE or step == MAX_ITERATIONS - 1:
             break

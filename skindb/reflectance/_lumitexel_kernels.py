@@ -35,7 +35,6 @@ from skindb.types import (
     IntCube,
     IntMatrix,
     IntMatrix32,
-    IntVector32,
     Matrix,
     Matrix32,
     Real,
@@ -124,7 +123,6 @@ class RootMemory(NamedTuple):
     mixed: Vector32  # values in cube-root space, or the prediction of a shorter step
     inverse: Vector32  # squared values plus the squared noise floor, to the power -1/3
     size: Vector32  # of residuals
-    size_bits: IntVector32  # the same memory as int32
 
 
 class Lumitexel(NamedTuple):
@@ -156,7 +154,7 @@ class Lumitexel(NamedTuple):
 def root_memory(size: int) -> RootMemory:
     """Memory for up to `size` samples."""
     v = np.empty((5, size), np.float32)
-    return RootMemory(v[0], v[1], v[2], v[3], v[4], v[4].view(np.int32))
+    return RootMemory(v[0], v[1], v[2], v[3], v[4])
 
 
 @kernel
@@ -556,7 +554,7 @@ def _root_scale(
     """Scale of the residuals in `root.size`, for the mean sample."""
     level = max(mean, floor)
     finest = MIN_ROOT_SCALE * level / np.cbrt(level * level + floor * floor)
-    return max(1.4826 * median_of(root.size, root.size_bits, count, finite), finest)
+    return max(1.4826 * median_of(root.size, count, finite), finest)
 
 
 @kernel
