@@ -360,14 +360,11 @@ def common_maps(
             continue
         values = fitted[name].values.reshape(len(codes), -1).astype(np.float32)
         is_trusted = (codes == TexelStatus.MEASURED) & finite_rows(values)
-        trust = is_trusted.astype(np.float32)
-        image, weight = atlas_values(np.nan_to_num(values), trust, triangles, raster)
+        image, weight = atlas_values(values, is_trusted, triangles, raster)
         if name == variables.DIFFUSE_REFLECTANCE:
             weight_inside = np.where(outside, np.float32(0), weight)
             found[variables.TEXEL_COVERAGE] = weight_inside
-        filled = (
-            push_pull(image, weight) if trust.any() else np.full_like(image, np.nan)
-        )
+        filled = push_pull(image, weight)
         filled[outside] = np.nan
         found[f"texel_{name}"] = filled if fitted[name].ndim == 2 else filled[..., 0]
     chosen = {name: found[name] for name in found if maps is None or name in maps}

@@ -438,7 +438,7 @@ def _runs(count: Index) -> tuple[Index, Index]:
 
 
 def atlas_values(
-    values: Array, trust: Array, faces: Faces, raster: tuple[Index32, Image]
+    values: Array, trust: AnyArray, faces: Faces, raster: tuple[Index32, Image]
 ) -> tuple[Image, Image]:
     """Values of the vertices, interpolated linearly at the centres of the texels of a map.
 

@@ -75,15 +75,11 @@ class ShardedArray(BackendArray):
         index_bytes = INDEX_BYTES * (self.shard // self.chunk) + CHECKSUM_BYTES
         start = 0
         whole = first == 0 and end == min(begin + self.shard, self.shape[0])
-        if whole or self.store.files[key].size <= SMALL_BYTES:
-            content = memoryview(self.store.read(key))
-            index = content[-index_bytes:]
-        else:
-            content = memoryview(b"")
-            index = memoryview(self.store.read(key, -index_bytes))
-        table = np.frombuffer(index[:-CHECKSUM_BYTES], "<u8").reshape(-1, 2)
-        table = table[first:last].astype(np.int64)
-        if not content:
+        whole = whole or self.store.files[key].size <= SMALL_BYTES
+        content = memoryview(self.store.read(key, 0 if whole else -index_bytes))
+        index = content[-index_bytes:-CHECKSUM_BYTES]
+        table = np.frombuffer(index, "<u8").reshape(-1, 2)[first:last].astype(np.int64)
+        if not whole:
             start = int(table[:, 0].min())
             content = memoryview(self.store.read(key, start, int(table.sum(1).max())))
         size = self.chunk * self.dtype.itemsize * int(np.prod(self.shape[1:]))
