@@ -38,6 +38,7 @@ from pathlib import Path
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
 
+import dask.array  # noqa: F401  see IMPORTED
 from bucket_server import new_bucket, own_cache, s3_server, settings
 from planted_population import TABLES, population
 from sphere import write_capture
@@ -49,6 +50,8 @@ from skindb.errors import InputError
 from skindb.store import Database
 from skindb.workflow import studies
 
+# so that the processes that are forked need not import what these use
+IMPORTED = (workflow.edit, workflow.ingest_take, workflow.refresh, workflow.withdraw)
 SUBJECT = "Xqz7"
 LEASE_S = 1.0  # so that the lease of a suspended writer expires soon
 END_S = 300.0  # after which a process hangs

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dask.array  # noqa: F401  so that processes that are forked need not import it
 import numpy as np
 import xarray as xr
 
