@@ -12,10 +12,11 @@ error of its held-out samples over their RMS, and the table has the median over 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated
 
 import numpy as np
@@ -45,12 +46,13 @@ from skindb.fit import (
     refit,
 )
 from skindb.fit.corrections import LightErrors, LightResiduals
+from skindb.fit.gloss import common_lobes, take_gloss
 from skindb.fit.rig import Common
 from skindb.optics.angles import half_difference
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.tables import kernel_tables, lookup
-from skindb.schema import dataset
+from skindb.schema import dataset, label
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -121,9 +123,22 @@ def samples_of(photographs: Photographs, chosen: NDArray[np.intp]) -> xr.Dataset
     )
 
 
-def skindb_fit(photographs: Photographs, training: Mask, *, eta: float) -> Fitted:
-    """Normals, R_d, dictionary and reduced basis of skindb, and the predictions of the model."""
+def skindb_fit(
+    photographs: Photographs,
+    training: Mask,
+    *,
+    eta: float,
+    lobes: Mapping[str, Array] = MappingProxyType({}),
+) -> Fitted:
+    """Normals, R_d, dictionary and reduced basis of skindb, and the predictions of the model;
+    with the lobes (8,) of a rig by the name of the object.
+    """
     samples = samples_of(photographs, np.flatnonzero(training))
+    if lobes:
+        applied = np.tile(lobes[photographs.name], (samples.sizes["surfel"], 1))
+        samples = samples.assign(
+            lobe_strength_applied=label("lobe_strength_applied", applied)
+        )
     samples, predict = fitted_samples(samples, eta=eta)
     predicted = predict(photographs.light, np.array([0.0, 0.0, 1.0]))
     normal = samples["shading_normal"].values.astype(np.float64)
@@ -302,6 +317,23 @@ def with_lights_of_others(people: list[Photographs]) -> list[Photographs]:
     ]
 
 
+def lobes_of_others(people: list[Photographs]) -> dict[str, Array]:
+    """Strengths (8,) of the lobes that the other objects have in common, by name."""
+    takes = {}
+    for person in people:
+        samples = samples_of(person, np.arange(len(person.light)))
+        samples = samples.assign(
+            scan_normal_error=label("scan_normal_error", NO_SCAN_DEGREES)
+        )
+        takes[person.name] = take_gloss(samples, eta=SKIN, regions={})
+    return {
+        name: common_lobes([takes[other] for other in takes if other != name])[
+            "rig_lobe_strength"
+        ].values[0]
+        for name in takes
+    }
+
+
 def face_rows(people: list[Photographs]) -> list[list[str]]:
     """Errors at held-out lights of the faces [%], mean over the people."""
     rig = [_light_residuals(person) for person in people]
@@ -384,7 +416,12 @@ def light_rows(objects: list[Photographs]) -> list[list[str]]:
     rows = [[title, *(f"{n} lights" for n in LIGHT_COUNTS)]]
     known = dict[tuple[str, int], Mask]()
     covered = []
-    for name, method in methods(SKIN).items():
+    compared = methods(SKIN)
+    if not measured:
+        compared["skindb with the lobes of the others"] = partial(
+            skindb_fit, eta=SKIN, lobes=lobes_of_others(objects)
+        )
+    for name, method in compared.items():
         cells = []
         for count in LIGHT_COUNTS:
             errors = []

@@ -5,10 +5,10 @@ subjects of the rig have in common.
 
 DB has fitted takes that `skindb simulate` wrote to CAPTURES. Each take is seen by its most
 frontal camera, without its scan, under some of its lights; every fifth one is held out.
-The lobes are those of every other one of the other takes, so that of two neighbours none
-decides for the other. The table has means over the takes of the errors at held-out lights
+The lobes are those that all other takes have in common, of the face alone or also of its
+regions. The first table has means over the takes of the errors at held-out lights
 (as in `benchmarks/real.py`), of R_d and of normals, and the fractions of R_d and of normals
-within the 95 % limits of their total errors.
+within the 95 % limits of their total errors; the second one errors of R_d [%] by region.
 """
 
 from __future__ import annotations
@@ -24,18 +24,24 @@ from numpy.typing import NDArray
 import skindb
 from benchmarks.real import ISOTROPIC_95, fitted_samples
 from benchmarks.real_photographs import HELD_OUT_EVERY, spread_lights
+from skindb.analysis.regions import own_masks
+from skindb.calibration.lights import rig_lobes
 from skindb.fit.gloss import common_lobes, take_gloss
 from skindb.fit.lumitexels import directions, lumitexels
+from skindb.ingest.surfels import blended_lobes
 from skindb.schema import label
+from skindb.schema.label import FACE
 from skindb.virtual.capture import at_foot_points, foot_points
 
 Array = NDArray[np.float64]
 
 ETA = 1.3
-LIGHT_COUNTS = (4, 6, 8, 12)
-MIN_FRONTAL = 0.2  # cosine at the face between the camera and a light
+LIGHT_COUNTS = (4, 6, 8)
+VARIANTS = ("without lobes of others", "lobes of the face", "lobes by region")
+REGIONS = (FACE, "forehead", "nose", "cheek", "lips", "chin")
+MIN_FRONTAL = 0.5  # cosine at the face between the camera and a light
 MIN_SAMPLES = 4
-PIXELS = 2500
+PIXELS = 1500
 COLUMNS = (
     "held-out lights [%]",
     "R_d [%]",
@@ -45,9 +51,10 @@ COLUMNS = (
 
 
 class Subject(NamedTuple):
-    """One camera's samples of a take, and what is true."""
+    """One camera's samples of a take, its regions, and what is true."""
 
     samples: xr.Dataset
+    masks: dict[str, NDArray[np.bool_]]
     light: Array  # (light, 3) directions; the camera is at +z
     normal: Array
     diffuse: Array
@@ -87,22 +94,29 @@ def subject(capture: xr.DataTree, model: xr.DataTree, truth: Path) -> Subject:
     across = np.cross(view, [0.0, 1.0, 0.0])
     across /= np.linalg.norm(across)
     axes = np.stack([across, np.cross(across, view), view])
+    masks = own_masks(capture["surfels"].to_dataset())
     return Subject(
-        samples.assign(surfel_normal=flat), light[shown] @ axes.T, normal, true[1]
+        samples.assign(surfel_normal=flat),
+        {FACE: np.ones(len(rows), bool)} | {k: mask[rows] for k, mask in masks.items()},
+        light[shown] @ axes.T,
+        normal,
+        true[1],
     )
 
 
-def errors(seen: Subject, count: int, lobes: Array | None) -> list[float]:
-    """The columns of the table for one take."""
+def errors(
+    seen: Subject, count: int, lobes: dict[str, tuple[float, ...]]
+) -> tuple[list[float], list[float]]:
+    """The columns of the table for one take, and the median error of R_d by region [%]."""
     held_out = np.arange(len(seen.light)) % HELD_OUT_EVERY == 0
     training = np.flatnonzero(~held_out)
     chosen = training[spread_lights(seen.light[training], count)]
     few = seen.samples.isel(light=chosen)
-    if lobes is not None:
-        applied = label("lobe_strength_applied", lobes)
-        few = few.assign(lobe_strength_applied=applied)
-    fitted, predict = fitted_samples(few, eta=ETA)
     position = seen.samples["surfel_position"].values.astype(np.float64)
+    if lobes:
+        applied = blended_lobes(position, seen.masks, lobes)
+        few = few.assign(lobe_strength_applied=label("lobe_strength_applied", applied))
+    fitted, predict = fitted_samples(few, eta=ETA)
     others = seen.samples.isel(light=np.flatnonzero(held_out))
     predicted = predict(
         directions(position, others["light_position"].values),
@@ -121,14 +135,19 @@ def errors(seen: Subject, count: int, lobes: Array | None) -> list[float]:
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     limit = ISOTROPIC_95 * fitted["normal_total_error"].values[shared]
     true = np.isfinite(angle)
-    return [
+    relative = 100 * off / seen.diffuse[shared]
+    by_region = [
+        float(np.nanmedian(relative[seen.masks[name][shared]])) for name in REGIONS
+    ]
+    columns = [
         100 * float(np.median(np.sqrt(wrong[square > 0] / square[square > 0]))),
-        100 * float(np.nanmedian(off / seen.diffuse[shared])),
+        by_region[0],
         float(np.nanmean(angle)),
         float(np.nanmedian(angle)),
         100 * float((off < 1.96 * total)[true].mean()),
         100 * float((angle < limit)[true].mean()),
     ]
+    return columns, by_region
 
 
 def main(
@@ -144,25 +163,38 @@ def main(
     subjects = {}
     for take in names:
         capture = database.read("capture", take)
-        known[take] = take_gloss(lumitexels(capture), eta=ETA)
+        masks = own_masks(capture["surfels"].to_dataset())
+        known[take] = take_gloss(lumitexels(capture), eta=ETA, regions=masks)
         model = database.read("model", take)
         subjects[take] = subject(capture, model, captures / f"{take}.truth.npz")
-    halves = [
-        common_lobes([known[take] for take in names[k::2]])["rig_lobe_strength"].values
-        for k in (1, 0)
-    ]
+    of_others = {
+        take: rig_lobes(common_lobes([known[x] for x in names if x != take]))
+        for take in names
+    }
     print(f"| {len(names)} virtual subjects | {' | '.join(COLUMNS)} |")
     print("|---" * (len(COLUMNS) + 1) + "|")
+    by_region = dict[str, Array]()
     for count in LIGHT_COUNTS:
-        for name in ("without", "with the lobes of others"):
-            rows = [
-                errors(seen, count, None if name == "without" else halves[k % 2])
-                for k, seen in enumerate(subjects.values())
-            ]
-            held, diffuse, mean, median, *covered = np.mean(rows, axis=0)
+        for variant in VARIANTS:
+            rows = []
+            for take, seen in subjects.items():
+                lobes = of_others[take] if variant != VARIANTS[0] else {}
+                if variant == VARIANTS[1]:
+                    lobes = {FACE: lobes[FACE]}
+                rows.append(errors(seen, count, lobes))
+            columns, regions = (
+                np.mean(part, axis=0) for part in zip(*rows, strict=True)
+            )
+            held, diffuse, mean, median, *covered = columns
             within = ", ".join(f"{value:.0f}" for value in covered)
+            name = f"{count} lights, {variant}"
+            by_region[name] = regions
             print(
-                f"| {count} lights, {name} | {held:.1f} | {diffuse:.1f} | {mean:.1f}, "
-                f"{median:.1f} | {within} |",
+                f"| {name} | {held:.1f} | {diffuse:.1f} | {mean:.1f}, {median:.1f} "
+                f"| {within} |",
                 flush=True,
             )
+    print(f"\n| R_d [%] | {' | '.join(REGIONS)} |")
+    print("|---" * (len(REGIONS) + 1) + "|")
+    for name, regions in by_region.items():
+        print(f"| {name} | {' | '.join(f'{value:.1f}' for value in regions)} |")

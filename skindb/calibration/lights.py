@@ -538,10 +538,19 @@ def rig_dome(dome: DomeRecord, calibration: xr.Dataset, *, where: str) -> DomeRe
         replace(camera, gain=tuple(gain.tolist()))
         for camera, gain in zip(dome.cameras, sensitivity.values, strict=True)
     )
-    lobes = calibration["rig_lobe_strength"].dropna("lobe").values
     return replace(
-        dome, lights=tuple(lights), cameras=tuple(cameras), lobes=tuple(lobes.tolist())
+        dome,
+        lights=tuple(lights),
+        cameras=tuple(cameras),
+        lobes=rig_lobes(calibration),
     )
+
+
+def rig_lobes(rig: xr.Dataset) -> dict[str, tuple[float, ...]]:
+    """Strengths (lobe,) of the face and of the regions that have them."""
+    strength = rig["rig_lobe_strength"].dropna("region")
+    rows = map(tuple, strength.values.tolist())
+    return dict(zip(map(str, strength["region"].values), rows, strict=True))
 
 
 def calibrate_positions(dome: DomeRecord, ball: BallFrames) -> xr.Dataset:

@@ -5,13 +5,13 @@ samples know its shape and strength.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import xarray as xr
 
 from skindb.fit.albedo import estimate_in_sequence
+from skindb.fit.joint import shared_lobes
 from skindb.fit.lumitexels import (
     GEOMETRY,
     POLARISATION,
@@ -42,7 +42,8 @@ from skindb.reflectance.lobes import evaluate_graded
 from skindb.reflectance.model import MIN_LOBE_WIDTH, Comparison
 from skindb.schema import dataset, variables
 from skindb.schema.declaration import MIN_SAMPLES_TRUSTED
-from skindb.types import Array, IntVector, unit
+from skindb.schema.label import FACE
+from skindb.types import Array, IntVector, Mask
 
 # Strength of the lobe over the median R_d. The first was chosen on four faces of Extended
 # Yale B; of five up to it, it is also the best for the four others and, at this width, for
@@ -56,11 +57,13 @@ MAX_DEVICES = 64  # lights times cameras; surfels with few samples are rare unde
 SURFELS = 2000  # of which those with few samples are used, at most
 USED = 300
 MIN_SURFELS = 30  # with many samples
-MIN_FRONTAL = 0.2  # cosine of the angle at the face between a camera and a light
 MIN_TAKES_LOBES = 3
-# lights that stand for a capture with few samples, and factors of the mean lobes of a rig
-FEW_LIGHTS = 8
-FACTORS = np.geomspace(0.5, 4.0, 7)
+# strength of the lobes of surfels with few samples over those of free lobes: the one of seven
+# with which eight lights predict the others best on nine virtual subjects, and on six others
+FEW_OVER_FREE = np.sqrt(2.0)
+# of the lobes of a rig in a take; 1 if fewer than `MIN_SURFELS` surfels have few samples, as
+# ten chose 2 for virtual skin of factor 1
+FACTORS = np.geomspace(0.25, 4.0, 9)
 
 
 def estimate_gloss(
@@ -100,30 +103,28 @@ def estimate_gloss(
     level = float(np.nanmedian(diffuse))
     priors = [Gloss(level * s, level * s * SPREAD) for s in STRENGTHS]
     errors = [_left_out_error(part, prior, eta, scan_error) for prior in priors]
+    best = _best(errors, default=0)
+    if variables.LOBE_STRENGTH_APPLIED not in lumitexels:
+        return priors[best]
+    factors = FACTORS if few.size >= MIN_SURFELS else [1.0]
+    of_rig = [Gloss(f, f * SPREAD, of_rig=True) for f in factors]
+    rig_errors = [_left_out_error(part, prior, eta, scan_error) for prior in of_rig]
+    nearest = _best(rig_errors, default=len(factors) // 2)
+    is_better = rig_errors[nearest] < (1 - MIN_GAIN) * errors[best]
+    return of_rig[nearest] if is_better else priors[best]
+
+
+def _best(errors: Sequence[float], *, default: int) -> int:
+    """Index of the smallest error, if it is below that of the default by an eighth."""
     best = int(np.argmin(errors))
-    best = best if errors[best] < (1 - MIN_GAIN) * errors[0] else 0
-    if variables.LOBE_STRENGTH_APPLIED in lumitexels:
-        prior = _shared(lumitexels[variables.LOBE_STRENGTH_APPLIED].values)
-        error = _left_out_error(part, prior, eta, scan_error)
-        if error < (1 - MIN_GAIN) * errors[best]:
-            return prior
-    return priors[best]
+    return best if errors[best] < (1 - MIN_GAIN) * errors[default] else default
 
 
-class TakeGloss(NamedTuple):
-    """What a take with many samples knows of the gloss: mean strengths (8,) of its lobes,
-    and surfels with one camera, from which `common_lobes` finds their factor.
-    """
-
-    lobes: Array
-    part: xr.Dataset
-    eta: float
-    scan_error: float
-
-
-def take_gloss(lumitexels: xr.Dataset, *, eta: float) -> TakeGloss | None:
-    """Gloss of a take; None if few surfels have 16 samples, or one camera fewer lights in
-    front.
+def take_gloss(
+    lumitexels: xr.Dataset, *, eta: float, regions: Mapping[str, Mask]
+) -> xr.Dataset:
+    """Mean strengths of the lobes of a take, of its face and regions; NaN for those of few
+    surfels with 16 samples.
 
     Parameters
     ----------
@@ -131,68 +132,54 @@ def take_gloss(lumitexels: xr.Dataset, *, eta: float) -> TakeGloss | None:
         Samples with geometry and `surfel_normal`.
     eta
         As in `estimate_normals`.
+    regions
+        Masks (surfel,).
     """
+    masks = {FACE: np.ones(lumitexels.sizes["surfel"]), **regions}
+    strengths = [
+        _mean_lobes(lumitexels.isel(surfel=np.flatnonzero(mask)), eta)
+        for mask in masks.values()
+    ]
+    return dataset(
+        {variables.RIG_LOBE_STRENGTH: strengths}, coords={"region": [*masks]}
+    )
+
+
+def _mean_lobes(lumitexels: xr.Dataset, eta: float) -> Array:
+    """Mean strengths (8,) of free lobes; NaN for few surfels."""
     part = _samples(lumitexels, SURFELS)
-    part = part.isel(surfel=_sample_count(part) >= MIN_SAMPLES_TRUSTED)
-    if part.sizes["surfel"] < MIN_SURFELS:
-        return None
-    part = part.isel(surfel=_spread(part.sizes["surfel"], USED))
+    rows = np.flatnonzero(_sample_count(part) >= MIN_SAMPLES_TRUSTED)
+    unknown = np.full(len(LOBE_REFLECTANCE), np.nan)
+    if len(rows) < MIN_SURFELS:
+        return unknown
     prior = scan_error(lumitexels)
-    refined = _refined(_estimated(part, eta, prior), UNKNOWN_GLOSS, eta, prior)
+    part = _estimated(part.isel(surfel=rows[_spread(len(rows), USED)]), eta, prior)
+    refined = _refined(part, UNKNOWN_GLOSS, eta, prior)
     fitted = np.isfinite(refined.normal_error)
-    by_camera = np.isfinite(part["reflectance_sample"].values).sum(axis=(0, 1, 3))
-    part = part.isel(camera=[int(by_camera.argmax())])
-    light, view = _directions_from_middle(part)
-    part = part.isel(light=light @ view > MIN_FRONTAL)
-    if fitted.sum() < MIN_SURFELS or part.sizes["light"] < MIN_SAMPLES_TRUSTED:
-        return None
-    return TakeGloss(refined.strength[fitted].mean(axis=0), part, eta, prior)
+    if fitted.sum() < MIN_SURFELS:
+        return unknown
+    return np.asarray(refined.strength[fitted].mean(axis=0))
 
 
-def common_lobes(takes: Sequence[TakeGloss | None]) -> xr.Dataset:
-    """Strengths of the lobes that the takes of a rig have in common: the medians of their
-    means, times the factor with which eight lights predict the others best.
+def common_lobes(takes: Sequence[xr.Dataset]) -> xr.Dataset:
+    """Strengths of the lobes that the takes of a rig have in common, by region: medians of
+    those of `take_gloss`, times `FEW_OVER_FREE`.
 
     Returns
     -------
     Dataset
-        `rig_lobe_strength`; NaN for fewer than three takes with many samples.
+        `rig_lobe_strength` of the face and of the regions; NaN for fewer than three takes
+        with many samples.
     """
-    known = [take for take in takes if take is not None]
-    lobes = np.full(len(LOBE_REFLECTANCE), np.nan)
-    if len(known) >= MIN_TAKES_LOBES:
-        lobes = np.median([take.lobes for take in known], axis=0)
-        errors = [
-            [_few_lights_error(take, f * lobes) for f in FACTORS] for take in known
-        ]
-        lobes *= FACTORS[np.sum(errors, axis=0).argmin()]
-    return dataset({variables.RIG_LOBE_STRENGTH: lobes})
-
-
-def _few_lights_error(take: TakeGloss, lobes: Array) -> float:
-    """Logarithm of the median relative error of all but eight spread lights, by these."""
-    part = take.part
-    light, view = _directions_from_middle(part)
-    chosen = [int((light @ view).argmax())]
-    while len(chosen) < FEW_LIGHTS:
-        chosen.append(int((light @ light[chosen].T).max(axis=1).argmin()))
-    few = _estimated(part.isel(light=chosen), take.eta, take.scan_error)
-    refined = _refined(few, _shared(lobes), take.eta, take.scan_error)
-    others = np.setdiff1d(np.arange(len(light)), chosen)
-    error = _errors(refined, part, others, take.eta)
-    return float(np.log(np.nanmedian(error))) if np.isfinite(error).any() else 0.0
-
-
-def _directions_from_middle(part: xr.Dataset) -> tuple[Array, Array]:
-    """Unit directions to the lights (light, 3) and to the first camera (3,)."""
-    middle = part["surfel_position"].values.mean(axis=0)
-    light = unit(part["light_position"].values - middle)
-    return light, unit(part["camera_position"].values[0] - middle)
-
-
-def _shared(lobes: Array) -> Gloss:
-    """Prior of these lobes."""
-    return Gloss(1.0, SPREAD, lobes=tuple(lobes.tolist()))
+    none = np.full((1, len(LOBE_REFLECTANCE)), np.nan)
+    empty = dataset({variables.RIG_LOBE_STRENGTH: none}, coords={"region": [FACE]})
+    of_takes = xr.concat([empty, *takes], "take", join="outer")
+    median = of_takes.median("take").where(of_takes.count("take") >= MIN_TAKES_LOBES)
+    strength = FEW_OVER_FREE * median[variables.RIG_LOBE_STRENGTH].values
+    return dataset(
+        {variables.RIG_LOBE_STRENGTH: strength},
+        coords={"region": median["region"].values},
+    )
 
 
 def _samples(lumitexels: xr.Dataset, surfels: int) -> xr.Dataset:
@@ -227,6 +214,7 @@ def _refined(part: xr.Dataset, prior: Gloss, eta: float, scan_error: float) -> J
         scan_normal=arrays["surfel_normal"],
         scan_error=float(np.deg2rad(scan_error) / np.sqrt(2)),
         gloss=prior,
+        lobes=shared_lobes(arrays, prior),
     )
 
 

@@ -25,13 +25,14 @@ from skindb.reflectance._lumitexel_kernels import (
 )
 from skindb.reflectance.joint import (
     LOBE_REFLECTANCE,
+    SHARED_LOBES,
     UNKNOWN_GLOSS,
     Gloss,
     JointFit,
     refine_block,
 )
 from skindb.reflectance.model import MIN_LOBE_WIDTH, Comparison
-from skindb.schema import check
+from skindb.schema import check, variables
 from skindb.schema.declaration import LARGEST_R_D, SMALLEST_R_D
 from skindb.types import Array
 
@@ -99,12 +100,14 @@ def refine_jointly(
     )
 
     def kernel(arrays: Arrays) -> tuple[Array, ...]:
+        lobes = shared_lobes(arrays, gloss)
         refined = refine_block(
             block_of(arrays, noise),
             comparison,
             scan_normal=arrays["surfel_normal"],
             scan_error=float(np.deg2rad(scan_error) / np.sqrt(2)),
             gloss=gloss,
+            lobes=lobes,
         )
         reflectance = np.clip(refined.diffuse, SMALLEST_R_D, LARGEST_R_D)
         columns = (
@@ -113,7 +116,7 @@ def refine_jointly(
             _total_angle(refined, arrays["shading_normal"]),
             reflectance,
             refined.diffuse_error,
-            _total_diffuse(refined, gloss),
+            _total_diffuse(refined, gloss, lobes),
             dipole_s(reflectance, eta=eta)[0],
         )
         converged = np.isfinite(refined.normal_error) & (refined.kkt < MAX_KKT)
@@ -138,7 +141,14 @@ def refine_jointly(
     )
 
 
-def _total_diffuse(refined: JointFit, gloss: Gloss) -> Array:
+def shared_lobes(arrays: Arrays, gloss: Gloss) -> Array:
+    """Strengths ([n,] 8), at factor 1, of the lobes of surfels with few samples."""
+    if gloss.of_rig:
+        return arrays[variables.LOBE_STRENGTH_APPLIED]
+    return np.array([SHARED_LOBES])
+
+
+def _total_diffuse(refined: JointFit, gloss: Gloss, lobes: Array) -> Array:
     """Total error (n, 3) of R_d, with what the surface may reflect more or less than it
     does elsewhere in the capture.
     """
@@ -148,8 +158,8 @@ def _total_diffuse(refined: JointFit, gloss: Gloss) -> Array:
     )
     if gloss.strength > 0:
         few = (samples >= MIN_SAMPLES_GLOSS) & (samples < MIN_SAMPLES_LOBES)
-        surface = gloss.spread * (LOBE_REFLECTANCE @ gloss.lobes)
-        model = np.hypot(model, np.where(few, surface, 0.0))
+        surface = gloss.spread * (lobes @ LOBE_REFLECTANCE)
+        model = np.hypot(model, np.where(few, surface[:, None], 0.0))
     return np.hypot(refined.diffuse_shared, model)
 
 

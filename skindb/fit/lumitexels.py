@@ -47,9 +47,8 @@ OPTIONAL = {
         *NOISE_LIGHTS,
         *POLARISATION,
         variables.RELATIVE_REFLECTANCE,
-        variables.LOBE_STRENGTH_APPLIED,
     ),
-    "surfels": (variables.SCAN_NORMAL_ERROR,),
+    "surfels": (variables.SCAN_NORMAL_ERROR, variables.LOBE_STRENGTH_APPLIED),
 }
 
 
@@ -153,12 +152,12 @@ def _polarisation(arrays: Arrays) -> Array:
 
 
 def noise_inputs(lumitexels: xr.Dataset) -> tuple[str, ...]:
-    """Names of the variables that `block_of` takes where they are known: those of
-    `noise_of`, and the polarisers.
+    """Names of the variables that fits take where they are known: those of `noise_of`, the
+    polarisers and the lobes of the rig.
     """
     return tuple(
         name
-        for group in (NOISE_INPUTS, POLARISATION)
+        for group in (NOISE_INPUTS, POLARISATION, (variables.LOBE_STRENGTH_APPLIED,))
         if all(name in lumitexels for name in group)
         for name in group
     )

@@ -36,7 +36,7 @@ from skindb.fit.translucency import fit_probe, summarise_translucency, transluce
 from skindb.jit import reported_compilation
 from skindb.parameters import FitParameters
 from skindb.reflectance.dictionary import Dictionary
-from skindb.reflectance.joint import UNKNOWN_GLOSS, Gloss
+from skindb.reflectance.joint import Gloss
 from skindb.reflectance.kinds import surface_model
 from skindb.reflectance.model import ReflectanceModel
 from skindb.schema import FitStatus, Use, dataset, label, names_of
@@ -138,7 +138,7 @@ def first_pass(
     with timer.stage("first pass"):
         part = fitted_part(samples, held_out)
         gloss = estimate_gloss(part, eta=parameters.eta, scan_error=scan_error(part))
-        if gloss.lobes != UNKNOWN_GLOSS.lobes:
+        if gloss.of_rig:
             reasons = reasons | {"gloss": "of the calibration, where samples are few"}
         fitted = _fit_surfels(part, surface, parameters, gloss)
     if parameters.inter_reflection:

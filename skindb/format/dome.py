@@ -134,7 +134,8 @@ class DomeRecord:
     relative: bool = False
     # takes of one rig without intensities are comparable if it is equal; 0 unknown
     relative_exposure: float = 0.0
-    lobes: tuple[float, ...] = ()  # strengths by a calibration from takes of the rig
+    # strengths by region, by a calibration from takes of the rig
+    lobes: Mapping[str, tuple[float, ...]] | None = None
 
     @property
     def frame_count(self) -> int:

@@ -16,7 +16,7 @@ from skindb.geometry.atlas import distortion
 from skindb.ingest.consistency import Calibration
 from skindb.ingest.lumitexels import Lumitexels
 from skindb.ingest.probe_profiles import Profiles
-from skindb.ingest.surfels import SurfelSet, transferred_landmarks
+from skindb.ingest.surfels import SurfelSet, blended_lobes, transferred_landmarks
 from skindb.parameters import SCAN_ERROR_DEGREES
 from skindb.schema import dataset
 from skindb.types import Float64, Half
@@ -48,6 +48,10 @@ def surfel_group(
     if surfels.region_names:
         variables["region_mask"] = surfels.region.astype(np.int8)
         coords["region"] = list(surfels.region_names)
+    if dome is not None and dome.lobes:
+        regions = dict(zip(surfels.region_names, surfels.region.T, strict=True))
+        strength = blended_lobes(surfels.position, regions, dome.lobes)
+        variables["lobe_strength_applied"] = strength
     if dome is not None and light_fraction is not None:
         variables |= {
             "light_visible_fraction": light_fraction,
@@ -105,8 +109,6 @@ def dome_group(dome: DomeRecord, intensity: Float64) -> xr.Dataset:
         variables["light_offset_applied"] = [light.offset for light in lights]
     if any(set(camera.gain) != {1.0} for camera in cameras):
         variables["camera_gain_applied"] = [camera.gain for camera in cameras]
-    if dome.lobes:
-        variables["lobe_strength_applied"] = dome.lobes
     by_light = [light.polarisation for light in lights]
     by_camera = [camera.polarisation for camera in cameras]
     if any(by_light) and any(by_camera):

@@ -12,6 +12,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from skindb.errors import require
 from skindb.format.dome import CameraRecord, LightRecord
@@ -30,6 +31,7 @@ from skindb.geometry.mesh import (
     vertex_normals,
 )
 from skindb.geometry.rays import RayScene
+from skindb.schema.label import FACE
 from skindb.types import Float32, Float64, Index, Mask, dots, float64, lengths
 
 MAX_SURFELS = 2_500_000  # the samples of this many surfels in a full dome take 36 GB
@@ -37,6 +39,9 @@ MAX_SURFELS = 2_500_000  # the samples of this many surfels in a full dome take 
 # distance was cropped away
 CROPPED_LANDMARK_MM = 0.5
 NECK_STRIP_HALF_WIDTH_MM = 15.0  # mm; half width of the strip at the front of the neck
+# nodes, 4 mm apart on a face, and those whose lobes are blended, within about 8 mm
+BLEND_NODES = 4000
+BLENDED = 13
 Half = NDArray[np.float16]
 VisibilityTest = Callable[[Index], Mask]  # surfels (m,) that face an eye -> (m,)
 # points of a light's disc besides its centre; each stands for a fifth of its area
@@ -235,6 +240,20 @@ def _regions(
         vertices = mesh.clean_vertex[ids]
         member[vertices[vertices >= 0], i] = 1.0
     return tuple(regions), member
+
+
+def blended_lobes(
+    position: Float64, regions: Mapping[str, Mask], lobes: Mapping[str, Sequence[float]]
+) -> Float64:
+    """Strengths (n, lobe) of the smallest region of a surfel, or else of the face; means over
+    the nearest of even nodes, so that no border of regions is seen in maps.
+    """
+    strength = np.tile(lobes[FACE], (len(position), 1))
+    for name in sorted(regions.keys() & lobes, key=lambda name: -regions[name].sum()):
+        strength[regions[name]] = lobes[name]
+    nodes = np.linspace(0, len(position) - 1, BLEND_NODES).astype(np.int64)
+    near = cKDTree(position[nodes]).query(position, BLENDED)[1]
+    return np.asarray(strength[nodes[near]].mean(axis=1))
 
 
 def light_visibility(

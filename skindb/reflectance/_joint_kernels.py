@@ -68,7 +68,7 @@ class Lobes(NamedTuple):
     """The lobes, from wide to narrow, and the scan's normals."""
 
     square: Vector32  # (LOBES,) squared roughness
-    shared: Vector32  # (LOBES,) strengths of the one lobe of surfels with few samples
+    shared: Matrix32  # (n, LOBES) strengths of the one lobe of surfels with few samples
     gloss: float  # mean factor of the shared lobe, of a prior
     gloss_spread: float  # standard deviation of this factor
     gloss_samples: int  # from which surfels have a lobe
@@ -415,20 +415,22 @@ def _eliminate_normal(m: JointMemory) -> bool:
 
 
 @kernel
-def _solve_parameters(count: int, lobes: Lobes, m: JointMemory) -> float:
+def _solve_parameters(s: int, count: int, lobes: Lobes, m: JointMemory) -> float:
     """Write `m.x` and `m.strength`; returns the KKT residual."""
     limit = 6 * PARAMETERS
     kkt, _, _, _ = solve_scaled(
         m.gram, m.target, m.x, KKT_TOLERANCE, limit, m.active_set
     )
     for j in range(LOBES):
-        together = m.x[3] * lobes.shared[j]
+        together = m.x[3] * lobes.shared[s, j]
         m.strength[j] = together if count < MIN_SAMPLES_LOBES else m.x[3 + j]
     return kkt
 
 
 @kernel
-def _write_lobes(count: int, lobes: Lobes, b: Lumitexel, m: JointMemory) -> None:
+def _write_lobes(
+    s: int, count: int, lobes: Lobes, b: Lumitexel, m: JointMemory
+) -> None:
     """Write the columns of the diffuse shape and of the lobes, or of the shared one."""
     _write_columns(count, lobes.square, b, m)
     if count >= MIN_SAMPLES_LOBES:
@@ -436,7 +438,7 @@ def _write_lobes(count: int, lobes: Lobes, b: Lumitexel, m: JointMemory) -> None
     for r in range(count):
         shared = ZERO
         for j in range(LOBES):
-            shared += lobes.shared[j] * m.table[r, LOBE + j]
+            shared += lobes.shared[s, j] * m.table[r, LOBE + j]
             m.table[r, LOBE + j] = ZERO
         m.table[r, LOBE] = shared
 
@@ -449,7 +451,7 @@ def _turn_normal(
     _add_scan(s, _variance(count, b, m), lobes, m)
     if not _eliminate_normal(m):
         return
-    _solve_parameters(count, lobes, m)
+    _solve_parameters(s, count, lobes, m)
     for k in range(2):
         m.step[k] = 0.0
         for q in range(2):
@@ -463,7 +465,7 @@ def _turn_normal(
     for k in range(3):
         m.normal[k] = m.turned[k]
     _face(m.normal, eta, lobes.square, b, m)
-    _write_lobes(count, lobes, b, m)
+    _write_lobes(s, count, lobes, b, m)
 
 
 @kernel
@@ -617,7 +619,7 @@ def _start(
             m.table[r, SAMPLE + c] = b.sample[c, r]
     _write_angles(count, lobes.refractive_index, b, m)
     _face(m.normal, eta, lobes.square, b, m)
-    _write_lobes(count, lobes, b, m)
+    _write_lobes(s, count, lobes, b, m)
 
 
 @kernel
@@ -641,13 +643,13 @@ def _fit(
             break
         wide += 1
     _linearise(s, count, wide, block, lobes, o, b, m, False)
-    _solve_parameters(count, lobes, m)
+    _solve_parameters(s, count, lobes, m)
     for _ in range(lobes.steps):
         _linearise(s, count, wide, block, lobes, o, b, m, True)
         _turn_normal(s, count, lobes, o.eta, b, m)
     _linearise(s, count, wide, block, lobes, o, b, m, False)
     out.samples[s] = count
-    out.kkt[s] = _solve_parameters(count, lobes, m)
+    out.kkt[s] = _solve_parameters(s, count, lobes, m)
     _write_equations(count, wide, lobes, b, m)
     _add_scan(s, _variance(count, b, m), lobes, m)
     _write_errors(s, count, b, m, out)

@@ -14,6 +14,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from skindb.reflectance._joint_kernels import LOBES, JointFit, Lobes, fit_jointly
 from skindb.reflectance._lumitexel_kernels import MIN_SAMPLES_GLOSS
@@ -46,15 +47,15 @@ STEPS_WITHOUT_SCAN = (4, 1.0)
 
 
 class Gloss(NamedTuple):
-    """Mean and standard deviation of the factor of the lobes that surfels with few samples
-    share, the number of samples from which they have them, and the strengths (8,) of these
-    lobes at factor 1.
+    """Mean and standard deviation of the factor of the lobes of surfels with few samples,
+    the number of samples from which they have them, and whether these are the lobes of the
+    rig.
     """
 
     strength: float
     spread: float
     samples: int = MIN_SAMPLES_GLOSS
-    lobes: tuple[float, ...] = SHARED_LOBES
+    of_rig: bool = False
 
 
 # Without it the lobe explains all light of one in eight pixels of a face under six lights.
@@ -68,6 +69,7 @@ def refine_block(
     scan_normal: Array,
     scan_error: float,
     gloss: Gloss = UNKNOWN_GLOSS,
+    lobes: ArrayLike = SHARED_LOBES,
 ) -> JointFit:
     """Normal, R_d and strengths of the lobes of n surfels, from the given ones.
 
@@ -83,6 +85,8 @@ def refine_block(
         Standard error of the scan's normals about each axis [rad], of a prior.
     gloss
         Prior of the lobes of surfels with fewer than twelve samples.
+    lobes
+        Strengths ([n,] 8) of these lobes at factor 1.
 
     Returns
     -------
@@ -102,9 +106,9 @@ def refine_block(
         kkt=np.full(n, np.nan),
         samples=np.zeros(n, np.int64),
     )
-    lobes = Lobes(
+    graded = Lobes(
         np.asarray(GRADED_ROUGHNESS**2, np.float32),
-        np.array(gloss.lobes, np.float32),
+        np.array(np.broadcast_to(lobes, (n, LOBES)), np.float32),
         gloss.strength,
         gloss.spread,
         gloss.samples,
@@ -114,5 +118,5 @@ def refine_block(
         *(STEPS if scan_error < MAX_SCAN_ERROR else STEPS_WITHOUT_SCAN),
     )
     options = kernel_options(comparison, solve=True)
-    fit_jointly(kernel_block(block), lobes, options, out)
+    fit_jointly(kernel_block(block), graded, options, out)
     return out

@@ -90,6 +90,11 @@ REGION_MASK = declare(
     uses=Use.COPIED | Use.SAMPLED | Use.SURVIVES_EDIT,
     absent=-1,
 )
+LOBE_STRENGTH_APPLIED = declare(
+    "float32 surfels/lobe_strength_applied(surfel, lobe) [1]",
+    "strengths, by a calibration from takes, of the lobes of graded widths that surfels with "
+    "few samples may share, blended between regions; unknown if absent",
+)
 
 # mesh
 TRIANGLE = declare(
@@ -159,11 +164,6 @@ LIGHT_OFFSET_APPLIED = declare(
 CAMERA_GAIN_APPLIED = declare(
     "float64 dome/camera_gain_applied(camera, channel) [1]",
     "gain by a calibration from takes, by which the radiance was divided; 1 if absent",
-)
-LOBE_STRENGTH_APPLIED = declare(
-    "float64 dome/lobe_strength_applied(lobe) [1]",
-    "strengths, by a calibration from takes, of the lobes of graded widths that surfels with "
-    "few samples may share; unknown if absent",
 )
 LIGHT_POLARISATION = declare(
     "float32 dome/light_polarisation(light) [1]",
@@ -310,9 +310,9 @@ RIG_CAMERA_SPREAD_LEFT = declare(
     "the same after division by the common gains of the other takes",
 )
 RIG_LOBE_STRENGTH = declare(
-    "float64 rig_calibration/rig_lobe_strength(lobe) [1]",
-    "strengths of the lobes of graded widths that the takes have in common, for surfels "
-    "with few samples; NaN for fewer than three takes with many",
+    "float64 rig_calibration/rig_lobe_strength(region, lobe) [1]",
+    "strengths of the lobes of graded widths that the takes have in common, of the face and of "
+    "its regions, for surfels with few samples; NaN for fewer than three takes with many",
 )
 RIG_MISFIT = declare(
     "float64 rig_calibration/rig_misfit(correction) [1]",

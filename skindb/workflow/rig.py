@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from xarray import DataArray, Dataset, DataTree
 
-from skindb.calibration.lights import is_same_rig, moved_lights
+from skindb.analysis.regions import own_masks
+from skindb.calibration.lights import is_same_rig, moved_lights, rig_lobes
 from skindb.errors import input_error, require
 from skindb.fit.corrections import MIN_GAIN_SPREAD, LightResiduals
-from skindb.fit.gloss import TakeGloss, common_lobes, take_gloss
+from skindb.fit.gloss import common_lobes, take_gloss
 from skindb.fit.lumitexels import lumitexels
 from skindb.fit.rig import (
     MIN_TAKES,
@@ -83,7 +84,7 @@ def calibrate_rig(
     inputs = list[Record]()
     residuals = list[tuple[LightResiduals, dict[str, Float64]]]()
     cameras = list[DataArray]()
-    gloss = list[TakeGloss | None]()
+    gloss = list[Dataset]()
     positions = dict[str, Float64]()
     for number, (take, model) in enumerate(models.items()):
         progress("lights", number, len(models))
@@ -100,7 +101,8 @@ def calibrate_rig(
         cameras.append(camera_gains)
         if "statistics" in db.consent(take):
             eta = float(fitted["fitted"][variables.REFRACTIVE_INDEX])
-            gloss.append(take_gloss(lumitexels(capture), eta=eta))
+            regions = own_masks(capture["surfels"].to_dataset())
+            gloss.append(take_gloss(lumitexels(capture), eta=eta, regions=regions))
         inputs += [record, model]
     names = [*positions]
     group = common_light_errors(
@@ -161,7 +163,7 @@ def describe_rig(db: Database, record: Record) -> dict[str, Any]:
                 strict=True,
             )
         ),
-        "lobes": rig[variables.RIG_LOBE_STRENGTH].dropna("lobe").values.tolist(),
+        "lobes": rig_lobes(rig),
         "angle": float(np.degrees(np.sqrt(np.square(turns).sum(axis=1).mean()))),
         "largest_angle_error": float(rig[variables.RIG_LIGHT_ANGLE_ERROR].max()),
         "without_gain": [str(light) for light in few],
@@ -201,7 +203,7 @@ def _lights(record: Record, capture: DataTree) -> dict[str, Float64]:
         record.provenance.get("calibrated_by")
         and variables.LIGHT_GAIN_APPLIED not in dome
         and variables.CAMERA_GAIN_APPLIED not in dome
-        and variables.LOBE_STRENGTH_APPLIED not in dome
+        and variables.LOBE_STRENGTH_APPLIED not in capture["surfels"]
     )
     require(
         not is_from_setup,
@@ -243,7 +245,7 @@ def _require_help(group: Dataset) -> None:
         (group[variables.RIG_LIGHT_GAIN] != 1).any()
         or (group[variables.RIG_LIGHT_OFFSET] != 0).any()
         or (group[variables.RIG_CAMERA_GAIN] != 1).any()
-        or np.isfinite(group[variables.RIG_LOBE_STRENGTH]).all()
+        or np.isfinite(group[variables.RIG_LOBE_STRENGTH]).any()
     ):
         return
     spread = float(group[variables.RIG_SPREAD])

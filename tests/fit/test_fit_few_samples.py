@@ -30,6 +30,7 @@ from skindb.schema import FitStatus, dataset, label
 
 ETA = 1.0  # without a smooth boundary Lambert's law is exact
 FAR_MM = 1e6
+NO_REGIONS = {}
 R_D = np.array([0.5, 0.3, 0.2])
 SURFELS = 60
 ROUGHNESS = 0.45  # between the widths of two lobes of the joint fit
@@ -178,19 +179,21 @@ def test_estimate_gloss__is_unknown_for_many_or_too_few_samples():
         assert prior == UNKNOWN_GLOSS
 
 
-def _rig_lobes(*, gloss):
-    """Lobes that three takes of other surfels under 24 lights have in common."""
+def _rig_lobes(*, gloss, regions=NO_REGIONS):
+    """Lobes by region that three takes of other surfels under 24 lights have in common."""
     takes = [
         _planted(_lights(24), gloss=gloss, noise=0.01, seed=s)[0] for s in (7, 8, 9)
     ]
     no_scan = label("scan_normal_error", 60.0)
     takes = [take.assign(scan_normal_error=no_scan) for take in takes]
-    known = [take_gloss(take, eta=ETA) for take in takes]
-    assert np.isnan(common_lobes([*known[:2], None])["rig_lobe_strength"]).all()
-    return common_lobes(known)["rig_lobe_strength"].values
+    known = [take_gloss(take, eta=ETA, regions=regions) for take in takes]
+    assert np.isnan(common_lobes(known[:2])["rig_lobe_strength"]).all()
+    return common_lobes(known)["rig_lobe_strength"]
 
 
 def _with_lobes(lumitexels, lobes):
+    """With lobes ([n,] 8) of the rig."""
+    lobes = np.broadcast_to(lobes, (SURFELS, len(GRADED_ROUGHNESS)))
     return lumitexels.assign(
         lobe_strength_applied=label("lobe_strength_applied", lobes)
     )
@@ -201,7 +204,7 @@ def test_common_lobes__of_a_rig_help_captures_with_few_samples(count, small_dict
     """The planted lobe is narrower than the one that surfels share without a rig."""
     lumitexels, normal = _planted(_lights(count), gloss=2 * STRENGTH, noise=0.01)
     alone = _fitted(lumitexels, small_dictionary)
-    lobes = _rig_lobes(gloss=2 * STRENGTH)
+    lobes = _rig_lobes(gloss=2 * STRENGTH).sel(region="face").values
     helped = _fitted(_with_lobes(lumitexels, lobes), small_dictionary)
     for name, error in (
         ("diffuse_reflectance", lambda x: np.abs(x / R_D - 1)),
@@ -212,21 +215,67 @@ def test_common_lobes__of_a_rig_help_captures_with_few_samples(count, small_dict
     assert np.median(np.abs(helped["diffuse_reflectance"] / R_D - 1)) < 0.02
 
 
-@pytest.mark.parametrize("count", [4, 6, 8])
-def test_estimate_gloss__lobes_of_another_population_are_not_used(count):
-    for gloss, of_others in ((0.0, 2 * STRENGTH), (2 * STRENGTH, 0.0)):
-        lumitexels, _ = _planted(_lights(count), gloss=gloss, noise=0.01)
-        wrong = _with_lobes(lumitexels, _rig_lobes(gloss=of_others))
-        alone, tried = (
-            estimate_gloss(capture, eta=ETA, scan_error=60.0)
-            for capture in (lumitexels, wrong)
-        )
-        assert alone == tried
+def test_common_lobes__by_region_help_where_gloss_differs(small_dictionary):
+    """Half of the face has a quarter of the gloss of the other; a region of few surfels
+    has none of its own.
+    """
+    nose = np.arange(SURFELS) % 2 == 0
+    gloss = np.where(nose, 2.0, 0.5)[:, None, None] * STRENGTH
+    regions = {"nose": nose, "cheek": ~nose, "lips": np.arange(SURFELS) < 29}
+    rig = _rig_lobes(gloss=gloss, regions=regions)
+    assert sorted(rig.dropna("region")["region"].values) == ["cheek", "face", "nose"]
+    lumitexels, _ = _planted(_lights(6), gloss=gloss, noise=0.01)
+    by_region = rig.sel(region=np.where(nose, "nose", "cheek")).values
+    errors = []
+    for lobes in (rig.sel(region="face").values, by_region):
+        fitted = _fitted(_with_lobes(lumitexels, lobes), small_dictionary)
+        off = np.abs(fitted["diffuse_reflectance"].values / R_D - 1)
+        errors.append([np.median(off[mask]) for mask in (nose, ~nose)])
+    assert max(errors[0]) > 0.2
+    assert max(errors[1]) < 0.03
+
+
+def test_refine_jointly__each_surfel_has_its_own_lobes():
+    """As in fits of every surfel by itself."""
+    lumitexels, _ = _planted(_lights(6), gloss=STRENGTH, noise=0.01)
+    lobes = np.random.default_rng(3).uniform(0, 2, (SURFELS, len(GRADED_ROUGHNESS)))
+    fitted = _with_lobes(lumitexels, lobes)
+    fitted = fitted.merge(estimate_normals(fitted, eta=ETA, scan_error=60.0))
+    fitted = fitted.merge(estimate_diffuse_reflectance(fitted, eta=ETA))
+    prior = Gloss(1.0, 0.5, of_rig=True)
+    together, *alone = (
+        refine_jointly(part, eta=ETA, scan_error=60.0, gloss=prior)
+        for part in (fitted, *(fitted.isel(surfel=[s]) for s in range(SURFELS)))
+    )
+    for name in ("diffuse_reflectance", "diffuse_reflectance_total_error"):
+        expected = np.concatenate([part[name].values for part in alone])
+        np.testing.assert_allclose(together[name], expected, rtol=1e-6)
+        assert len(np.unique(expected)) > SURFELS
+
+
+@pytest.mark.parametrize("count", [4, 8])
+@pytest.mark.parametrize(("gloss", "of_others"), [(1, 0), (0, 1), (1, 0.5), (0.5, 1)])
+def test_estimate_gloss__lobes_of_another_population(
+    count, gloss, of_others, small_dictionary
+):
+    """R_d is as good as alone, and its total error contains the truth."""
+    lumitexels, _ = _planted(_lights(count), gloss=2 * gloss * STRENGTH, noise=0.01)
+    rig = _rig_lobes(gloss=2 * of_others * STRENGTH).sel(region="face").values
+    errors = []
+    for capture in (lumitexels, _with_lobes(lumitexels, rig)):
+        fitted = _fitted(capture, small_dictionary)
+        off = np.abs(fitted["diffuse_reflectance"].values - R_D)
+        errors.append(np.median(off / R_D))
+    total = fitted["diffuse_reflectance_total_error"].values
+    assert errors[1] < errors[0] + 0.02
+    assert (off < 1.96 * total).mean() > 0.95
 
 
 def test_take_gloss__needs_sixteen_samples():
     lumitexels, _ = _planted(_lights(15), gloss=STRENGTH)
-    assert take_gloss(lumitexels, eta=ETA) is None
+    known = take_gloss(lumitexels, eta=ETA, regions=NO_REGIONS)
+    for takes in ([], 3 * [known]):
+        assert np.isnan(common_lobes(takes)["rig_lobe_strength"]).all()
 
 
 def test_refine_jointly__three_samples_have_no_gloss_whatever_the_prior():

@@ -13,7 +13,10 @@ from skindb.geometry.camera import camera_centre, pixel_rays, project
 from skindb.geometry.mesh import morton_order, subdivide, vertex_normals
 from skindb.geometry.rays import RayScene
 from skindb.ingest.surfels import (
+    BLEND_NODES,
+    BLENDED,
     SurfelSet,
+    blended_lobes,
     camera_visibility,
     disc_points,
     light_visibility,
@@ -381,3 +384,36 @@ def test_subdivision_levels__the_scan_alone_may_be_too_fine(capture, monkeypatch
 def test_subdivision_levels__refuses_zero(capture):
     with pytest.raises(ValueError, match="must be positive"):
         subdivision_levels(capture.surface, 0.0)
+
+
+def test_blended_lobes__change_evenly_over_the_borders_of_regions():
+    """Surfels on a line, 0.01 mm apart, and the means over 13 nodes by hand; the lips are
+    within the nose, which begins at 10 mm.
+    """
+    x = np.linspace(0, 30, 3001)
+    position = np.stack([x, 0 * x, 0 * x], axis=1)
+    regions = {"lips": x > 20, "nose": x > 10, "unknown": x > 15}
+    lobes = {"face": (1.0, 0.0), "nose": (3.0, 4.0), "lips": (5.0, 6.0)}
+    blended = blended_lobes(position, regions, lobes)
+    nodes = np.linspace(0, 3000, BLEND_NODES).astype(int)
+    for place in (0.0, 9.98, 10.0, 10.02, 15.0, 25.0):
+        near = np.argsort(np.abs(x[nodes] - place), kind="stable")[:BLENDED]
+        by_hand = np.mean(
+            [
+                lobes["lips" if v > 20 else "nose" if v > 10 else "face"]
+                for v in x[nodes[near]]
+            ],
+            axis=0,
+        )
+        # nodes at the same distance on both sides
+        np.testing.assert_allclose(
+            blended[np.abs(x - place).argmin()], by_hand, atol=4.0 / BLENDED + 1e-9
+        )
+    # a border would be a step of 4
+    assert np.abs(np.diff(blended, axis=0)).max() < 1.0
+    for nothing in ({}, {"unknown": x > 15}):
+        even = blended_lobes(position, nothing, lobes)
+        np.testing.assert_allclose(even, np.tile([1.0, 0.0], (len(x), 1)))
+    # surfels farther apart than nodes keep the lobes of their region
+    few = blended_lobes(position[::500], {"nose": x[::500] > 10}, lobes)
+    np.testing.assert_allclose(few[:, 0], np.where(x[::500] > 10, 3.0, 1.0))
