@@ -234,7 +234,7 @@ def _draw_lumitexel(ax: Axes, samples: Dataset, surfel: Dataset, dome: Dataset) 
     ax.set(xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), xticks=[], yticks=[], aspect="equal")
     ax.figure.colorbar(shown, ax=ax, shrink=0.7)
     ax.set_title(f"camera {dome['camera'].values[camera]}", fontsize=8)
-    ax.legend(fontsize=6, loc="lower left")
+    ax.legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.5, 0), ncols=2)
 
 
 def _normals(source: Source, picture: Path) -> list[str]:
@@ -326,9 +326,9 @@ def _components(source: Source, picture: Path) -> list[str]:
 
 
 def _spheres(source: Source, picture: Path) -> list[str]:
-    space = source.study("surface", takes=_of_subject(source), group_by="condition")
+    space = source.study("surface", group_by="condition")
     write_plot(plot_group_spheres(space["brdf_space"].to_dataset().load()), picture)
-    return ["Mean surface BRDFs of the takes of one subject."]
+    return ["Mean surface BRDFs over subjects; those of the paper are of one."]
 
 
 def _basis_sizes(source: Source, picture: Path) -> list[str]:
