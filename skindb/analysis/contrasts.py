@@ -108,6 +108,8 @@ def contrasts(
         return _paired(cohort, group_by, measure)
     require_adjustable(everyone, adjust, compared)
     takes, subjects = takes_to_compare(cohort, group_by)
+    for name in (compared, *adjust):
+        subjects.require_constant(name)
     quantities = measure(takes).of_subjects()
     names = quantities.subject
     attribute = subjects.by_subject(compared, names)

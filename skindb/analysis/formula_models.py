@@ -24,7 +24,7 @@ from skindb.analysis.formulas import (
     with_levels,
 )
 from skindb.analysis.long_form import COLUMNS as VALUES
-from skindb.analysis.long_form import tidy
+from skindb.analysis.long_form import INTERCEPT, tidy
 from skindb.analysis.study import (
     Population,
     Results,
@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 BASELINE = "baseline"
+WITHOUT = "without (1 | subject)"  # the reason of a model that needs it
 RESIDUAL = "residual"
-INTERCEPT = "Intercept"
 # variance of a random effect over that of the residual, below which it is at its bound
 BOUND = 1e-6
 COLUMNS = (
@@ -153,7 +153,9 @@ def linear_model(
         f"formula {formula}",
         "some region must determine it",
         "; ".join(dict.fromkeys(reasons)) or "no take with all its variables",
-        "use fewer terms, or add takes",
+        "add (1 | subject)"
+        if any(WITHOUT in reason for reason in reasons)
+        else "use fewer terms, or add takes",
     )
     stated = {"formula": formula, "margin": margin}
     return _labelled(model, fits, flags, cohort, stated)
@@ -236,7 +238,7 @@ def _fit(
         model.is_mixed or people == len(rows),
         "formula",
         "must have (1 | subject) if subjects have several takes",
-        f"{len(rows)} takes of {people} subjects without (1 | subject)",
+        f"{len(rows)} takes of {people} subjects {WITHOUT}",
     )
     require(
         not model.is_mixed or people < len(rows),
@@ -249,6 +251,12 @@ def _fit(
         "formula",
         "must have (1 | subject/NAME) only if values of NAME have several takes",
         f"one {model.nested} of each subject, or one take of each {model.nested}",
+    )
+    require(
+        len(rows) > people * random.shape[1] or not model.slopes,
+        "formula",
+        "must have fewer random effects than takes",
+        f"{random.shape[1]} of each of {people} subjects, {len(rows)} takes",
     )
     y = rows["value"].to_numpy(float)
     require(
@@ -502,9 +510,10 @@ def plot_model(table: Dataset, *, ax: Axes | None = None) -> Axes:
             colour=colour,
         )
     ax.set_yticks(places, names, fontsize=7)
-    count = int(table[variables.MODEL_SUBJECTS].max())
+    counts = sorted({*table[variables.MODEL_SUBJECTS].values.tolist()})
+    n = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
     ax.set_xlabel(
-        f"estimate over its standard error, 95 % CI (n = {count})\nfilled: p < 0.05"
+        f"estimate over its standard error, 95 % CI (n = {n})\nfilled: p < 0.05"
     )
     plots.legend_above(ax)
     return ax

@@ -24,6 +24,7 @@ from skindb.schema.cohort import require_takes, visit_of
 from skindb.types import Array, Index
 
 KEYS = ("take", "subject", CONDITION, "visit", "repeat")
+INTERCEPT = "Intercept"  # a term of every model
 COLUMNS = (
     "quantity",
     "region",
@@ -56,8 +57,8 @@ def tidy(cohort: Dataset) -> pd.DataFrame:
         for all takes; `baseline`, the value of the subject's first take in the condition
         normal, NaN for the takes of that visit; status; label (the class of an individual
         typology angle); and each attribute of the captures, as ``attribute_<name>`` if
-        it has the name of another column. Takes without a white target have R_d with
-        the status "relative" and no colours.
+        it has the name of another column, or is called Intercept. Takes without a white
+        target have R_d with the status "relative" and no colours.
 
         Quantities: R_d, surface reflectance and sigma_tr; CIELAB L*, a*, b*, individual
         typology angle (ITA), melanin index and erythema index of R_d, see
@@ -77,7 +78,9 @@ def tidy(cohort: Dataset) -> pd.DataFrame:
     require_takes(cohort, "tables")
     subjects = subjects_of(cohort)
     attributes = {
-        f"attribute_{name}" if name in (*KEYS, *COLUMNS) else name: attribute.values
+        f"attribute_{name}"
+        if name in (*KEYS, *COLUMNS, INTERCEPT)
+        else name: attribute.values
         for name, attribute in subjects.attributes.items()
         if name != CONDITION
     }

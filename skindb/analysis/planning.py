@@ -12,7 +12,6 @@ from xarray import Dataset
 
 from skindb import plots
 from skindb.analysis.formula_models import (
-    INTERCEPT,
     RESIDUAL,
     information_of,
     is_constant_within,
@@ -25,6 +24,7 @@ from skindb.analysis.formulas import (
     names_of,
     sum_of,
 )
+from skindb.analysis.long_form import INTERCEPT
 from skindb.analysis.study import Population, Results, Study, Table, table_of
 from skindb.errors import require
 from skindb.parameters import option, require_limits

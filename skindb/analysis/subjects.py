@@ -173,6 +173,25 @@ class Subjects:
                 value_of.setdefault(subject, value)
         return Attribute(name, tuple(value_of.get(subject) for subject in subjects))
 
+    def require_constant(self, name: str) -> None:
+        """Raise `InputError` if words of an attribute differ between takes of a subject."""
+        attribute = self.attribute(name)
+        values: dict[str, set[Value]] = {}
+        for subject, value in zip(self.subject, attribute.values, strict=True):
+            values.setdefault(subject, set()).add(value)
+        differ = [
+            f"{', '.join(sorted(map(str, known)))} of {subject}"
+            for subject, found in values.items()
+            if len(known := found - {None}) > 1
+        ]
+        require(
+            attribute.is_numeric or not differ,
+            f"attribute {name}",
+            "must be the same in all takes of a subject",
+            differ[0] if differ else "",
+            "compare within subjects by analyze model, with (1 | subject)",
+        )
+
     def rows_of(self, subject: str) -> Mask:
         """Mask (take,) of the takes of a subject."""
         return np.array([name == subject for name in self.subject], bool)

@@ -14,6 +14,7 @@ from skindb.analysis.contrasts import FEW
 from skindb.analysis.quantities import trusted
 from skindb.analysis.study import Population, Results, Study, table_of
 from skindb.analysis.subjects import Groups, grouped
+from skindb.errors import require
 from skindb.numerics.statistics import (
     SUMMARY,
     intraclass_correlation,
@@ -82,8 +83,15 @@ def translucency_table(cohort: Dataset, *, group_by: str | None = None) -> Datas
     require_comparable(cohort, "tables")
     groups = grouped(cohort, group_by)
     names = [name for name in PROBED if name in groups.takes]
+    require(
+        PROBED[0] in names,
+        "population",
+        "must have sites of the probe",
+        "no take with any",
+        "add a probe to the captures",
+    )
     takes = groups.takes[names].load()
-    sites = takes["site"].values.tolist() if PROBED[0] in takes else []
+    sites = takes["site"].values.tolist()
     sigma_tr, noise, total = (
         float64(trusted(takes, name).values)
         if name in takes

@@ -179,8 +179,8 @@ def ingest(
     """Ingest capture folders into the database DB.
 
     The database is created if it is absent. A folder with faults is not committed, and
-    does not stop the others. An interrupted ingest leaves nothing, and the same
-    command begins it again. Nothing is done if the newest version was made of the
+    does not stop the others. An interrupted ingest leaves nothing visible, and the
+    same command begins it again. Nothing is done if the newest version was made of the
     same files, with the same parameters, by the same code. A capture of a subject who
     was withdrawn is refused. The same session of a subject in a condition is a new
     version of its take, and another session is the next visit unless a visit is stated.

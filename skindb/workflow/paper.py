@@ -20,9 +20,11 @@ from skindb.files import make_private, private_file
 from skindb.render.figures import write_grid
 from skindb.render.photographs import Comparison, compare_photographs
 from skindb.schema import variables
+from skindb.schema.label import CHANNELS
 from skindb.store import Database
 from skindb.types import Progress, silent, unit
 from skindb.workflow.audit import logged_action
+from skindb.workflow.cohorts import require_fitted
 from skindb.workflow.edits import basis_grid, edit_grid
 from skindb.workflow.pictures import show_take, translucency_grid
 from skindb.workflow.studies import study
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
 
 PAGE = "figures.md"
 MAX_FACES = 5  # of figure 11
+PARTS = ("upper", "lower")  # of the face, in figure 5
 MAX_ROWS = 4  # of figure 19
 TRAITS = ("beard_density", "european", "tan", "lotion")  # of figure 19
 PEOPLE = ["condition", "ancestry", "gender"]  # rows of table 1
@@ -131,6 +134,7 @@ def reproduce(
     Weyrich et al. 2005, tables 1 and 2 and figures 5 to 7, 10 to 12 and 14 to 19.
     """
     models = db.takes("model")
+    require_fitted(db, models)
     table = db.table()
     table = table[table.index.isin(models)]
     source = Source(db, table, take or _most_conditions(table), dictionary, progress)
@@ -198,22 +202,23 @@ def _lumitexels(source: Source, picture: Path) -> list[str]:
     surfels = capture["surfels"].to_dataset()
     height = surfels[variables.SURFEL_POSITION].values[:, 1]
     upper = height > np.median(height[counts > 0])
-    for ax, is_part in zip(axes, (upper, ~upper), strict=True):
+    for ax, is_part, part in zip(axes, (upper, ~upper), PARTS, strict=True):
         at = int(np.argmax(np.where(is_part, counts, -1)))
-        _draw_lumitexel(
+        camera = _draw_lumitexel(
             ax, samples.isel(surfel=at).load(), surfels.isel(surfel=at).load(), dome
         )
+        ax.set_title(f"a surfel of the {part} half, camera {camera}", fontsize=8)
     write_plot(axes[0], picture)
     seen = counts[counts > 0]
     return [
         f"On average {seen.mean():.0f}, at most {seen.max()} samples of each of "
-        f"{len(seen):,} surfels; colours are radiance over irradiance [sr^-1]."
+        f"{len(seen):,} surfels."
     ]
 
 
-def _draw_lumitexel(ax: Axes, samples: Dataset, surfel: Dataset, dome: Dataset) -> None:
-    """Samples of one surfel in the camera that has most of them, over the hemisphere of
-    light directions.
+def _draw_lumitexel(ax: Axes, samples: Dataset, surfel: Dataset, dome: Dataset) -> str:
+    """Draw the samples of one surfel in the camera that has most of them over the
+    hemisphere of light directions, and return the name of the camera.
     """
     values = samples[variables.REFLECTANCE_SAMPLE].mean("channel").values
     camera = int(np.argmax(np.isfinite(values).sum(axis=0)))
@@ -227,14 +232,14 @@ def _draw_lumitexel(ax: Axes, samples: Dataset, surfel: Dataset, dome: Dataset) 
     is_known = np.isfinite(values[:, camera])
     x, y = frame @ to_light[is_known].T
     shown = ax.scatter(x, y, c=values[is_known, camera], s=22, cmap="viridis")
-    ax.plot(*(frame @ to_camera), "o", color=plots.RED, label="camera")
-    ax.plot(*(frame @ mirrored), "o", color=plots.GREEN, label="mirror direction")
+    ax.plot(*(frame @ to_camera), "s", color=plots.RED, label="camera")
+    ax.plot(*(frame @ mirrored), "*", color=plots.RED, label="mirror direction")
     turn = np.linspace(0, 2 * np.pi, 100)
     ax.plot(np.cos(turn), np.sin(turn), color="0.7", linewidth=0.8)
     ax.set(xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), xticks=[], yticks=[], aspect="equal")
-    ax.figure.colorbar(shown, ax=ax, shrink=0.7)
-    ax.set_title(f"camera {dome['camera'].values[camera]}", fontsize=8)
+    ax.figure.colorbar(shown, ax=ax, shrink=0.7, label="sample [sr^-1]")
     ax.legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.5, 0), ncols=2)
+    return str(dome["camera"].values[camera])
 
 
 def _normals(source: Source, picture: Path) -> list[str]:
@@ -266,19 +271,22 @@ def _profiles(source: Source, picture: Path) -> list[str]:
             probe[name].sel(site=site).values[order]
             for name in (variables.FIBRE_PROFILE, variables.FIBRE_PROFILE_ERROR)
         )
-        values[values < 2 * errors] = np.nan
-        for channel, colour in enumerate(plots.CHANNELS):
+        # beyond the first value that noise reaches, others are above it by chance
+        is_noise = np.logical_or.accumulate(values < 3 * errors, axis=0)
+        values = np.where(is_noise, np.nan, values)
+        for name, colour, line in zip(CHANNELS, plots.CHANNELS, values.T, strict=True):
             ax.semilogy(
-                distance[order], values[:, channel], "o-", color=colour, markersize=3
+                distance[order], line, "o-", color=colour, markersize=3, label=name
             )
         ax.set_title(site, fontsize=8)
         ax.set_xlabel("distance [mm]")
     axes[0, 0].yaxis.set_major_formatter("{x:.0e}")
     axes[0, 0].set_ylabel("reflectance [mm^-2]")
+    axes[0, 0].legend(fontsize=7)
     write_plot(axes[0, 0], picture)
     return [
-        "Means over the azimuths of the fibres, above twice their standard error; colours "
-        "are channels."
+        "Means over the azimuths of the fibres, up to where they are below three standard "
+        "errors."
     ]
 
 
@@ -296,6 +304,8 @@ def _photographs(source: Source, picture: Path) -> list[str]:
         first = next(iter(compared.values()), comparison)
         if comparison.mask.shape == first.mask.shape:
             compared[str(take)] = comparison
+        else:
+            refused.append(f"Not shown: {take}, whose pictures have another size")
         if len(compared) == MAX_FACES:
             break
     require(compared, "photographs", "some take must have some", "\n".join(refused))
@@ -342,7 +352,9 @@ def _basis_sizes(source: Source, picture: Path) -> list[str]:
     for (name, takes), colour in zip(groups.items(), plots.CYCLE, strict=False):
         curve = source.study("brdf", takes=takes)["basis_size"].to_dataset().load()
         error = curve[variables.RELATIVE_ERROR]
-        ax.plot(curve["k"], error, "o-", color=colour, markersize=3, label=name)
+        ax.plot(
+            curve["k"], error, "o-", color=colour, markersize=3, label=name, alpha=0.7
+        )
         low, high = (
             curve[f"{variables.RELATIVE_ERROR}_{end}"] for end in ("low", "high")
         )
@@ -372,14 +384,21 @@ def _translucent(source: Source, picture: Path) -> list[str]:
 def _edits(source: Source, picture: Path) -> list[str]:
     traits = source.study("traits")["traits"].to_dataset()["trait"].values.tolist()
     chosen = [name for name in TRAITS if name in traits] or traits[:MAX_ROWS]
-    edit_grid(
+    edited = edit_grid(
         source.db,
         source.take,
         {name: {name: 1.0} for name in chosen},
         picture,
         dictionary=source.dictionary,
     )
-    return [f"Traits {', '.join(chosen)}; sigma_tr changes with a trait, too."]
+    words = [
+        f"{name} {float(model.attrs['edit_distance']):.2g}"
+        for name, model in edited.items()
+    ]
+    return [
+        "Each trait is added with the strengths 0.5 and 1, also to a face that has it.",
+        f"Distance from the nearest take, above 1 outside the data: {', '.join(words)}.",
+    ]
 
 
 def _of_subject(source: Source) -> list[str]:
@@ -398,7 +417,7 @@ def _markdown(rows: pd.DataFrame) -> str:
 def _cell(value: Any) -> str:
     if isinstance(value, float):
         return "-" if np.isnan(value) else f"{value:.5g}"
-    return str(value)
+    return str(value).replace("|", "\\|")
 
 
 ITEMS = (
@@ -442,7 +461,7 @@ ITEMS = (
     Item(
         "Figures 17 and 18: least and most translucent",
         _translucent,
-        "sigma_tr of (0.3558, 0.7932, 1.5173) and (0.9171, 1.5682, 1.6569) mm^-1.",
+        "sigma_tr of (0.9171, 1.5682, 1.6569) and (0.3558, 0.7932, 1.5173) mm^-1.",
     ),
     Item("Figure 19: edits", _edits, "beard, Caucasian, tan and lotion."),
 )

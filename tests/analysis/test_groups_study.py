@@ -46,6 +46,20 @@ def test_group_effects__a_planted_difference_is_found_and_nothing_else():
     assert (one["effect_p_adjusted"].sel(quantity=rest) > 0.05).all()
 
 
+def test_group_effects__refuse_what_differs_within_subjects():
+    """A crossover is compared within subjects, by a model."""
+    arms = np.array(["b", "c", "c", "b"] * 10)
+    cohort = planted_tables(np.repeat(_people(20), 2).tolist(), arm=arms)
+    with pytest.raises(InputError, match="found b, c of S00"):
+        _compare(cohort, "arm")
+    with pytest.raises(InputError, match="attribute arm"):
+        _compare(
+            cohort.assign_coords(sex=("take", ["m", "m", "f", "f"] * 10)),
+            "sex",
+            adjust=("arm",),
+        )
+
+
 def test_group_effects__are_student_s_test_where_nothing_is_adjusted():
     """The permutation p of two groups against SciPy's Welch and permutation tests, on
     the log scale of sigma_tr.

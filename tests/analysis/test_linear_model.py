@@ -288,6 +288,18 @@ def test_linear_model__words_are_in_the_order_of_their_numbers():
     assert numbers["C"].cat.categories.tolist() == [-2.0, 1.5, 10.0]
 
 
+def test_linear_model__needs_more_takes_than_random_effects():
+    two = planted().isel(take=[i for i in range(4 * PEOPLE) if i % 4 < 2])
+    with pytest.raises(InputError, match="2 of each of 24 subjects, 48 takes"):
+        linear_model(two, formula="R_d ~ visit + (1 + visit | subject)")
+
+
+def test_linear_model__an_attribute_called_intercept_is_not_the_intercept():
+    cohort = planted().assign_coords(Intercept=("take", np.arange(4.0 * PEOPLE)))
+    table = linear_model(cohort, formula="R_d ~ attribute_Intercept + (1 | subject)")
+    assert table["term"].values.tolist() == ["Intercept", "attribute_Intercept"]
+
+
 def test_linear_model__says_whose_baseline_is_of_a_later_visit():
     cohort = planted()
     first = cohort["take"].values[0]
@@ -329,6 +341,7 @@ def test_linear_model__says_whose_baseline_is_of_a_later_visit():
         ),
         ("R_d ~ age + (0 + visit | subject)", "has random effects 1 and NAME"),
         ("R_d ~ age + (1 + treatment | subject)", "treatment is not a number"),
+        ("R_d ~ Intercept + (1 | subject)", "Intercept: must be columns"),
         ("R_d ~ exit(age) + (1 | subject)", "has the terms NAME"),
         ("R_d ~ age + __import__('os').getpid()", "has the terms NAME"),
         ("R_d ~ {age} + (1 | subject)", "has the terms NAME"),

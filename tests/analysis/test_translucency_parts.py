@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from planted_tables import planted_tables
 
 from skindb.analysis import translucency_table
+from skindb.errors import InputError
 
 
 def _cohort(subjects, repeats, *, people, repeat, noise, seed):
@@ -56,3 +58,9 @@ def test_translucency_table__parts_are_nan_if_undetermined():
     noisy = translucency_table(_cohort(8, 1, people=0.01, repeat=0.0, noise=0.0, seed=1).assign(
         site_sigma_tr_error=lambda one: one["site_sigma_tr"] * 0 + 1.0))  # fmt: skip
     assert (noisy["sigma_tr_people_fraction"] == 0).all()
+
+
+def test_translucency_table__needs_a_probe():
+    cohort = _cohort(3, 1, people=0.2, repeat=0.0, noise=0.1, seed=1)
+    with pytest.raises(InputError, match="must have sites of the probe"):
+        translucency_table(cohort.drop_dims("site"))

@@ -7,6 +7,7 @@ import pytest
 
 from skindb import workflow
 from skindb.errors import InputError
+from skindb.store import Database
 
 pytestmark = pytest.mark.slow
 
@@ -52,6 +53,11 @@ def test_reproduce__prints_the_means_and_variances_of_the_study(
         np.testing.assert_allclose(float(row[3]), at["sigma_tr_mean"], rtol=1e-3)
         np.testing.assert_allclose(float(row[4]), at["sigma_tr_variance"], rtol=1e-3)
         assert float(row[5]) == published
+
+
+def test_reproduce__refuses_a_database_without_models(tmp_path):
+    with pytest.raises(InputError, match="fit"):
+        workflow.reproduce(Database(tmp_path / "db"), tmp_path / "out")
 
 
 def test_reproduce__refuses_a_take_without_a_model(fitted_database, tmp_path):
