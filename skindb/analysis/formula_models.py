@@ -49,6 +49,7 @@ WITHOUT = "without (1 | subject)"  # the reason of a model that needs it
 RESIDUAL = "residual"
 # variance of a random effect over that of the residual, below which it is at its bound
 BOUND = 1e-6
+ALONE = 1e-9  # one less the leverage of a take, below which it determines a term alone
 COLUMNS = (
     variables.MODEL_ESTIMATE,
     variables.MODEL_ERROR,
@@ -93,7 +94,8 @@ def linear_model(
     -------
     Dataset
         (quantity, term), see the variables of the group "linear_model": estimates by restricted
-        maximum likelihood (statsmodels' MixedLM; least squares without a random part),
+        maximum likelihood (statsmodels' MixedLM; without a random part least squares,
+        with HC3 errors, which hold for unequal variances),
         Student's intervals and p values with the degrees of freedom between subjects
         for terms that are constant within subjects or have random slopes, within
         subjects for others, and between nested values for those constant within them.
@@ -110,8 +112,8 @@ def linear_model(
 
     References
     ----------
-    Laird and Ware 1982; Schluchter and Elashoff 1990 (degrees of freedom);
-    Schuirmann 1987 (equivalence).
+    Laird and Ware 1982; MacKinnon and White 1985 (HC3); Schluchter and Elashoff 1990
+    (degrees of freedom); Schuirmann 1987 (equivalence).
     """
     require_comparable(cohort, "tables")
     contrasts = (contrasts,) if isinstance(contrasts, str) else tuple(contrasts)
@@ -383,8 +385,14 @@ def _solve(
     """
     if not groups:
         estimate = np.linalg.lstsq(x, y, rcond=None)[0]
-        variance = float(((y - x @ estimate) ** 2).sum()) / (len(y) - x.shape[1])
-        return estimate, variance * np.linalg.inv(x.T @ x), np.sqrt([variance])
+        rest = y - x @ estimate
+        variance = float((rest**2).sum()) / (len(y) - x.shape[1])
+        inverse = np.linalg.inv(x.T @ x)
+        free = 1 - np.einsum("ij,jk,ik->i", x, inverse, x)
+        is_alone = free < ALONE  # has a level of its own: HC3 does not know its error
+        square = np.where(is_alone, variance, (rest / np.maximum(free, ALONE)) ** 2)
+        covariance = inverse @ (x.T * square) @ x @ inverse
+        return estimate, covariance, np.sqrt([variance])
     # takes a second to import
     from statsmodels.regression.mixed_linear_model import MixedLM, VCSpec
 
