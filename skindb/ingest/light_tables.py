@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 
@@ -20,6 +22,7 @@ MAX_TABLE_BYTES = 4 << 20
 COLUMNS = ("x", "y", "z")
 # of a file of lights; positions are in mm
 POSITION_COLUMNS = ("x_mm", "y_mm", "z_mm")
+INTENSITY = "intensity"
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,7 @@ def read_lights(path: Path, pictures: Sequence[str] = ()) -> list[Light]:
         values = numbers(words[1:])
         if not found and not header and any(value is None for value in values[-3:]):
             header = [word.lower() for word in words]
+            faults += _misspelt(header, path)
             continue
         place = f"{path}, line {number}"
         light = attempt(faults, partial(_table_light, words, header, place))
@@ -85,6 +89,21 @@ def read_lights(path: Path, pictures: Sequence[str] = ()) -> list[Light]:
             path, f"must have 1 to {MAX_LIGHTS:,} lights", f"{len(found)} lights"
         )
     return found
+
+
+def _misspelt(header: Sequence[str], path: Path) -> list[Fault]:
+    """Faults of columns whose names are nearly those that are read; others are ignored."""
+    known = (*COLUMNS, *POSITION_COLUMNS, INTENSITY)
+    return [
+        Fault(
+            f"{path}, column {short(name)}",
+            f"columns that are read are {', '.join(known)}",
+            "another name",
+            f"write {near[0]}",
+        )
+        for name in header[1:]
+        if name not in known and (near := get_close_matches(name, known, 1, 0.8))
+    ]
 
 
 def _is_unnamed(lines: Sequence[Sequence[str]]) -> bool:
@@ -113,10 +132,13 @@ def _named(
 
 def _words(line: str) -> list[str]:
     """Cells of a line of a table; a name in front may contain spaces."""
-    line = re.sub(r"(^|\s)#.*", "", line).strip()  # names may contain the sign
+    # names may contain the sign
+    line = re.sub(r"^\s*#.*|(?<=[\d.])\s+#.*", "", line).strip()
     for separator in (";", "\t", ","):
-        if separator in line:
-            cells = [cell.strip().strip('"') for cell in line.split(separator)]
+        # a name in quotes may contain it
+        cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
+        if len(cells) > 1:
+            cells = [cell.strip() for cell in cells]
             if separator == ",":
                 return cells
             # numbers with decimal commas
@@ -157,7 +179,7 @@ def _table_light(words: Sequence[str], header: Sequence[str], place: str) -> Lig
     values = numbers(
         [cells.get(key, "") for key in (COLUMNS if distant else POSITION_COLUMNS)]
     )
-    gain = numbers([cells.get("intensity", "1")])[0]
+    gain = numbers([cells.get(INTENSITY, "1")])[0]
     vector = np.array([np.nan if value is None else value for value in values])
     usable = 0 < np.linalg.norm(vector) < np.inf
     require(

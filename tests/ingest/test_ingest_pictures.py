@@ -300,6 +300,9 @@ def test_a_mask_and_grey_pictures(pictures: Path, tmp_path: Path) -> None:
         ("2\nmy file.png 1 0 1\nC:\\x\\b.png 0 1 1\n", 2),
         ("a.png;1,0;0,0;1,0\nb.png;0;1;1\n", 2),
         ("a#1.png 1 0 1 # left\nb.png 0 1 1\n", 2),
+        ("kä #se.png,1,0,1\nb.png,0,1,1\n", 2),
+        ('"seven, comma.png",1,0,1\n"b.png", 0, 1, 1\n', 2),
+        ("name,x,y,z,exposure\na.png,1,0,1,1/60\nb.png,0,1,1,1/30\n", 2),
         ("# comment\nname;x;y;z;intensity\na.png;1;0;1;2\nb.png;0;1;1;1\n", 2),
     ],
 )
@@ -349,6 +352,7 @@ def test_what_is_assumed_of_pictures_is_noted(tmp_path: Path) -> None:
         ("a.png,1,nan,0\n", "line 1"),
         ("picture,x,y,z\na.png,1,zero,1\n", "line 2"),
         ("a.png,x,y,z,intensity\nb.png,1,0,1,-1\n", "line 2"),
+        ("picture,x,y,z,intensities\na.png,1,0,1,5\n", "write intensity"),
         ("", "0 lights"),
         ("a.png,-0,7,0,1,0,7\n", "decimal points"),
         ("picture,x,y,z\na.png,1,0,1,2\n", "4 cells"),
