@@ -58,7 +58,10 @@ def read_picture(path: Path) -> Picture:
         raise input_error(
             str(path),
             f"a picture must be a whole {FORMATS} file",
-            short(str(error)),
+            # libraries name what only they know
+            short(str(error))
+            if type(error) is ValueError
+            else "what cannot be decoded",
             "export it as PNG, JPEG or plain TIFF; raw and HEIC files have to be converted",
         ) from None
     colour = picture[..., : 3 if picture.shape[2] > 2 else 1]

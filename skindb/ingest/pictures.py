@@ -267,6 +267,9 @@ class _Frames:
         self.levels = list[float]()
         self.faults = list[Fault]()
         self.exposures = dict[float, str]()  # by EXIF -> a file
+        self.files_by_grey = dict[
+            bool, str
+        ]()  # whether all channels are equal -> a file
         self.automatic_white = False
         self.newest = 0.0  # time of the newest picture
         self.notes = list[str]()
@@ -336,6 +339,9 @@ class _Frames:
         if self.linear:
             used = picture if inside is None else picture[inside]
             self.levels.append(float(np.quantile(used, BRIGHT_QUANTILE)))
+        if picture.any():
+            is_grey = bool((picture == picture[..., :1]).all())
+            self.files_by_grey.setdefault(is_grey, file.name)
         target = self.out / f"dome/frames/{light}_{camera['id']}{self.suffix}"
         make_private(target.parent)
         write_frame(target, picture)
@@ -371,6 +377,11 @@ class _Frames:
             self.notes.append(
                 "the camera chose the white balance of each picture (EXIF): colours are "
                 "less certain, and takes differ by it; set it by hand"
+            )
+        if len(self.files_by_grey) > 1:
+            self.notes.append(
+                f"{self.files_by_grey[True]} is grey, and others are not: colours are wrong "
+                "unless all pictures are of one kind"
             )
         bits = 8 * self.dtype.itemsize
         for camera in cameras:

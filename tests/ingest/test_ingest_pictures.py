@@ -331,6 +331,16 @@ def test_directions_without_names_are_those_of_the_pictures_in_their_order(
         read_lights(path, ["a.png", "b.png"])
 
 
+def test_a_grey_picture_beside_others_in_colour_is_noted(tmp_path: Path) -> None:
+    lights = directions(4)
+    names = write_pictures(tmp_path / "pictures", lights)
+    write_table(tmp_path / "pictures/lights.csv", names, lights)
+    first = tmp_path / "pictures" / names[0]
+    write_frame(first, np.repeat(read_picture(first)[..., :1], 3, axis=2))
+    notes = import_images(tmp_path / "pictures", tmp_path / "capture", PERSON).notes
+    assert any(note.startswith(f"{names[0]} is grey") for note in notes)
+
+
 def test_what_is_assumed_of_pictures_is_noted(tmp_path: Path) -> None:
     lights = directions(4)
     write_pictures(tmp_path / "pictures", lights, suffix=".tif")
