@@ -108,7 +108,7 @@ def refine_block(
     )
     graded = Lobes(
         np.asarray(GRADED_ROUGHNESS**2, np.float32),
-        np.array(np.broadcast_to(lobes, (n, LOBES)), np.float32),
+        np.ascontiguousarray(np.broadcast_to(lobes, (n, LOBES)), np.float32),
         gloss.strength,
         gloss.spread,
         gloss.samples,
