@@ -30,8 +30,8 @@ IN_TABLES = (variables.MEAN_DICTIONARY_WEIGHT, variables.DISC_ANGULAR_RADIUS)
 SIZE = 512  # texels along each side of the stored maps of a registration
 # degrees between the normal and a half vector, within which a surfel must be seen for its
 # surface reflectance to count: without the peak of its lobe it is a third too low, by an
-# amount that depends on the shape of the face. Chosen, as the patches, on 12 virtual
-# subjects of 4 cameras and 24 lights; docs/validation.md has two other domes
+# amount that depends on the shape of the face. Chosen on ten virtual subjects of 4 cameras
+# and 24 lights, the patches after another dome was seen; docs/validation.md has a third
 MAX_HALF_ANGLE = 12.0
 # mm; errors of surface reflectance are independent between patches of this size only
 PATCH_SIZE = 20.0

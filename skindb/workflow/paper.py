@@ -165,7 +165,9 @@ def _most_conditions(table: pd.DataFrame) -> str:
 
 def _people(source: Source, _: Path) -> list[str]:
     table = source.table.reindex(columns=["subject", "age", *PEOPLE])
-    groups = table.groupby(PEOPLE, dropna=False)
+    # laboratories may have words in place of ages
+    table["age"] = pd.to_numeric(table["age"], errors="coerce")
+    groups = table.groupby(PEOPLE, dropna=False, sort=False)
     rows = groups.agg(
         subjects=("subject", "nunique"), youngest=("age", "min"), oldest=("age", "max")
     )

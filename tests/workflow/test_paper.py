@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from skindb import workflow
 from skindb.errors import InputError
 from skindb.store import Database
+from skindb.workflow import paper
 
 pytestmark = pytest.mark.slow
 
@@ -64,3 +66,20 @@ def test_reproduce__refuses_a_take_without_a_model(fitted_database, tmp_path):
     with pytest.raises(InputError, match="S09"):
         workflow.reproduce(fitted_database, tmp_path / "out", take="S09")
     assert not (tmp_path / "out").exists()
+
+
+def test_people__have_any_words_for_their_attributes():
+    table = pd.DataFrame(
+        {
+            "subject": ["3", "nan", "3"],
+            "condition": "normal",
+            "age": [31, "31-40", None],
+            "gender": ["f", 2, "f"],
+        }
+    )
+    source = paper.Source(None, table, "3", None, print)
+    (page,) = paper._people(source, None)
+    assert page.splitlines()[2:] == [
+        "| normal | - | f | 1 | 31 | 31 |",
+        "| normal | - | 2 | 1 | - | - |",
+    ]
