@@ -23,6 +23,7 @@ COLUMNS = ("x", "y", "z")
 # of a file of lights; positions are in mm
 POSITION_COLUMNS = ("x_mm", "y_mm", "z_mm")
 INTENSITY = "intensity"
+SYNONYMS = ("gain", "power", "brightness", "strength", "flux")  # of the intensity
 
 
 @dataclass(frozen=True)
@@ -99,10 +100,11 @@ def _misspelt(header: Sequence[str], path: Path) -> list[Fault]:
             f"{path}, column {short(name)}",
             f"columns that are read are {', '.join(known)}",
             "another name",
-            f"write {near[0]}",
+            f"write {INTENSITY if name in SYNONYMS else near[0]}",
         )
         for name in header[1:]
-        if name not in known and (near := get_close_matches(name, known, 1, 0.8))
+        if name not in known
+        and ((near := get_close_matches(name, known, 1, 0.8)) or name in SYNONYMS)
     ]
 
 

@@ -363,6 +363,7 @@ def test_what_is_assumed_of_pictures_is_noted(tmp_path: Path) -> None:
         ("picture,x,y,z\na.png,1,zero,1\n", "line 2"),
         ("a.png,x,y,z,intensity\nb.png,1,0,1,-1\n", "line 2"),
         ("picture,x,y,z,intensities\na.png,1,0,1,5\n", "write intensity"),
+        ("picture,x,y,z,gain\na.png,1,0,1,5\n", "write intensity"),
         ("", "0 lights"),
         ("a.png,-0,7,0,1,0,7\n", "decimal points"),
         ("picture,x,y,z\na.png,1,0,1,2\n", "4 cells"),
