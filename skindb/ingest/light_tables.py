@@ -67,7 +67,7 @@ def read_lights(path: Path, pictures: Sequence[str] = ()) -> list[Light]:
         values = numbers(words[1:])
         if not found and not header and any(value is None for value in values[-3:]):
             header = [word.lower() for word in words]
-            faults += _misspelt(header, path)
+            faults += _header_faults(header, path)
             continue
         place = f"{path}, line {number}"
         light = attempt(faults, partial(_table_light, words, header, place))
@@ -92,10 +92,12 @@ def read_lights(path: Path, pictures: Sequence[str] = ()) -> list[Light]:
     return found
 
 
-def _misspelt(header: Sequence[str], path: Path) -> list[Fault]:
-    """Faults of columns whose names are nearly those that are read; others are ignored."""
+def _header_faults(header: Sequence[str], path: Path) -> list[Fault]:
+    """Faults of columns that are absent, or whose names are nearly those that are read;
+    others are ignored.
+    """
     known = (*COLUMNS, *POSITION_COLUMNS, INTENSITY)
-    return [
+    faults = [
         Fault(
             f"{path}, column {short(name)}",
             f"columns that are read are {', '.join(known)}",
@@ -106,13 +108,28 @@ def _misspelt(header: Sequence[str], path: Path) -> list[Fault]:
         if name not in known
         and ((near := get_close_matches(name, known, 1, 0.8)) or name in SYNONYMS)
     ]
+    if faults or any(set(c) <= set(header[1:]) for c in (COLUMNS, POSITION_COLUMNS)):
+        return faults
+    return [
+        Fault(
+            str(path),
+            f"a header names the picture and {', '.join(COLUMNS)} of the direction to "
+            f"its light, or {', '.join(POSITION_COLUMNS)} of its position",
+            short(", ".join(header)),
+            "name or compute these columns",
+        )
+    ]
 
 
-def _is_unnamed(lines: Sequence[Sequence[str]]) -> bool:
-    """Whether every line of a table is a direction without the name of a picture."""
-    used = [words for words in lines if words]
+def _is_unnamed(lines: list[list[str]]) -> bool:
+    """Whether every line of a table is a direction without the name of a picture; a header
+    of such lines, which names no pictures, is emptied.
+    """
+    used = [k for k, words in enumerate(lines) if words]
+    if used and [word.lower() for word in lines[used[0]]] == list(COLUMNS):
+        lines[used.pop(0)] = []
     return bool(used) and all(
-        len(words) == len(COLUMNS) and None not in numbers(words) for words in used
+        len(lines[k]) == len(COLUMNS) and None not in numbers(lines[k]) for k in used
     )
 
 
@@ -134,8 +151,8 @@ def _named(
 
 def _words(line: str) -> list[str]:
     """Cells of a line of a table; a name in front may contain spaces."""
-    # names may contain the sign
-    line = re.sub(r"^\s*#.*|(?<=[\d.])\s+#.*", "", line).strip()
+    # names may contain the sign: comments follow two numbers
+    line = re.sub(r"^\s*#.*|([\d.]([\s,;]+[-+.\de]+){2})\s+#.*", r"\1", line).strip()
     for separator in (";", "\t", ","):
         # a name in quotes may contain it
         cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])

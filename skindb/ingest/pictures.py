@@ -498,7 +498,9 @@ def _matched(source: Path, files: Sequence[Path], table: Sequence[Light]) -> lis
 
 
 def _require_directions(place: Path, table: Sequence[Light]) -> list[str]:
-    """Require lights in front of the subject and not in a plane; a note on those behind."""
+    """Require lights in front of the subject and not in a plane; notes on those behind,
+    and on those in one place.
+    """
     way = np.array([light.vector / np.linalg.norm(light.vector) for light in table])
     behind = [light.name for light in table if light.vector[2] <= 0]
     require(
@@ -516,9 +518,14 @@ def _require_directions(place: Path, table: Sequence[Light]) -> list[str]:
         f"{len(table)} directions that are",
         "add lights elsewhere, or correct the columns x, y, z",
     )
+    places = [
+        tuple((w if light.distant else light.vector).round(4))
+        for light, w in zip(table, way, strict=True)
+    ]
+    same = [x.name for x, at in zip(table, places, strict=True) if places.count(at) > 1]
     return [f"lights behind the subject, z not above 0: {few_names(behind)}"] * any(
         behind
-    )
+    ) + [f"pictures under a light in the same place: {few_names(same)}"] * any(same)
 
 
 def _typical(files: Sequence[Path]) -> Path:

@@ -301,6 +301,7 @@ def test_a_mask_and_grey_pictures(pictures: Path, tmp_path: Path) -> None:
         ("a.png;1,0;0,0;1,0\nb.png;0;1;1\n", 2),
         ("a#1.png 1 0 1 # left\nb.png 0 1 1\n", 2),
         ("kä #se.png,1,0,1\nb.png,0,1,1\n", 2),
+        ("shot 2 #3.png,1,0,1\nb.png,0,1,1 # left\n", 2),
         ('"seven, comma.png",1,0,1\n"b.png", 0, 1, 1\n', 2),
         ("name,x,y,z,exposure\na.png,1,0,1,1/60\nb.png,0,1,1,1/30\n", 2),
         ("# comment\nname;x;y;z;intensity\na.png;1;0;1;2\nb.png;0;1;1;1\n", 2),
@@ -319,7 +320,7 @@ def test_directions_without_names_are_those_of_the_pictures_in_their_order(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "light_directions.txt"
-    path.write_text("1 0 1\n\n0.5 -0.5 1\n")
+    path.write_text("X,Y,Z\n1,0,1\n\n0.5 -0.5 1\n")
     table = read_lights(path, ["p2.png", "p10.png"])
     assert [light.name for light in table] == ["p2.png", "p10.png"]
     assert np.array_equal(table[1].vector, [0.5, -0.5, 1])
@@ -339,6 +340,15 @@ def test_a_grey_picture_beside_others_in_colour_is_noted(tmp_path: Path) -> None
     write_frame(first, np.repeat(read_picture(first)[..., :1], 3, axis=2))
     notes = import_images(tmp_path / "pictures", tmp_path / "capture", PERSON).notes
     assert any(note.startswith(f"{names[0]} is grey") for note in notes)
+
+
+def test_two_pictures_under_one_light_are_noted(tmp_path: Path) -> None:
+    lights = directions(5)
+    lights[4] = 2 * lights[1]
+    names = write_pictures(tmp_path / "pictures", lights)
+    write_table(tmp_path / "pictures/lights.csv", names, lights)
+    notes = import_images(tmp_path / "pictures", tmp_path / "capture", PERSON).notes
+    assert f"pictures under a light in the same place: {names[1]}, {names[4]}" in notes
 
 
 def test_what_is_assumed_of_pictures_is_noted(tmp_path: Path) -> None:
@@ -364,6 +374,7 @@ def test_what_is_assumed_of_pictures_is_noted(tmp_path: Path) -> None:
         ("a.png,x,y,z,intensity\nb.png,1,0,1,-1\n", "line 2"),
         ("picture,x,y,z,intensities\na.png,1,0,1,5\n", "write intensity"),
         ("picture,x,y,z,gain\na.png,1,0,1,5\n", "write intensity"),
+        ("picture,azimuth,elevation\na.png,10,20\n", "a header names .*azimuth"),
         ("", "0 lights"),
         ("a.png,-0,7,0,1,0,7\n", "decimal points"),
         ("picture,x,y,z\na.png,1,0,1,2\n", "4 cells"),
