@@ -267,9 +267,9 @@ class _Frames:
         self.levels = list[float]()
         self.faults = list[Fault]()
         self.exposures = dict[float, str]()  # by EXIF -> a file
-        self.files_by_grey = dict[
-            bool, str
-        ]()  # whether all channels are equal -> a file
+        # whether all channels are equal -> a file
+        self.files_by_grey = dict[bool, str]()
+        self.files_by_content = dict[int, Path]()
         self.automatic_white = False
         self.newest = 0.0  # time of the newest picture
         self.notes = list[str]()
@@ -342,6 +342,17 @@ class _Frames:
         if picture.any():
             is_grey = bool((picture == picture[..., :1]).all())
             self.files_by_grey.setdefault(is_grey, file.name)
+            if np.ptp(picture) > 0:
+                same = self.files_by_content.setdefault(hash(picture.tobytes()), file)
+                if same != file:
+                    self.faults.append(
+                        Fault(
+                            str(file),
+                            "every picture must have been taken by itself",
+                            f"a copy of {same.name}",
+                            "copy the right picture from the camera again",
+                        )
+                    )
         target = self.out / f"dome/frames/{light}_{camera['id']}{self.suffix}"
         make_private(target.parent)
         write_frame(target, picture)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import unicodedata
 from collections.abc import Sequence
 from pathlib import Path
@@ -340,6 +341,15 @@ def test_a_grey_picture_beside_others_in_colour_is_noted(tmp_path: Path) -> None
     write_frame(first, np.repeat(read_picture(first)[..., :1], 3, axis=2))
     notes = import_images(tmp_path / "pictures", tmp_path / "capture", PERSON).notes
     assert any(note.startswith(f"{names[0]} is grey") for note in notes)
+
+
+def test_copies_are_named_by_their_pictures(tmp_path: Path) -> None:
+    lights = directions(4)
+    names = write_pictures(tmp_path / "pictures", lights)
+    write_table(tmp_path / "pictures/lights.csv", names, lights)
+    shutil.copy(tmp_path / "pictures" / names[1], tmp_path / "pictures" / names[3])
+    with pytest.raises(InputError, match=f"{names[3]}: .*a copy of {names[1]}"):
+        import_images(tmp_path / "pictures", tmp_path / "capture", PERSON)
 
 
 def test_two_pictures_under_one_light_are_noted(tmp_path: Path) -> None:
