@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -46,6 +46,15 @@ def new_axes(width: float, height: float) -> Axes:
     ax: Axes
     _, ax = pyplot.subplots(figsize=(width, height))
     return ax
+
+
+def axes_of_rows(names: Sequence[str], ax: Axes | None) -> tuple[Axes, Array]:
+    """Axes with a row for each name, by default new ones, and the places (n,) of the rows."""
+    ax = ax or new_axes(6.5, 1.2 + 0.22 * len(names))
+    places = np.arange(float(len(names)))[::-1]
+    ax.set_yticks(places, names, fontsize=7)
+    ax.set_ylim(-0.6, len(names) - 0.4)
+    return ax, places
 
 
 def legend_above(ax: Axes, *, fontsize: float = 7) -> None:

@@ -203,14 +203,12 @@ def describe_correlations(table: Dataset) -> list[str]:
 def plot_correlations(table: Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot the correlations with their 95 % intervals, one row per pair."""
     names = table["pair"].values.tolist()
-    ax = ax or plots.new_axes(6.5, 1.0 + 0.24 * len(names))
+    ax, place = plots.axes_of_rows(names, ax)
     ax.axvline(0, color="0.6", linewidth=1)
-    place = np.arange(float(len(names)))[::-1]
     name = variables.COMPONENT_CORRELATION
     significant = table[variables.CORRELATION_P_FALSE_DISCOVERY].values < 0.05
     colour = plots.CYCLE[0]
     plots.significant_intervals(ax, table, name, place, significant, colour=colour)
-    ax.set_yticks(place, names, fontsize=7)
     ax.set_xlim(-1, 1)
     count = int(table[variables.CORRELATION_COUNT].max())
     has_intervals = table[variables.COMPONENT_CORRELATION_LOW].notnull().any()

@@ -501,11 +501,10 @@ def plot_model(table: Dataset, *, ax: Axes | None = None) -> Axes:
     """
     terms = [term for term in table["term"].values.tolist() if term != INTERCEPT]
     names = table["quantity"].values.tolist()
-    ax = ax or plots.new_axes(6.5, 1.2 + 0.3 * len(names))
+    ax, places = plots.axes_of_rows(names, ax)
     ax.axvline(0, color="0.6", linewidth=1)
     error = table[variables.MODEL_ERROR]
     shown = table[list(COLUMNS[:4])] / error
-    places = np.arange(float(len(names)))[::-1]
     for i, term in enumerate(terms):
         colour = plots.CYCLE[i % len(plots.CYCLE)]
         ax.plot([], [], "o", color=colour, markersize=4, label=term)
@@ -517,7 +516,6 @@ def plot_model(table: Dataset, *, ax: Axes | None = None) -> Axes:
             table[variables.MODEL_P].sel(term=term).values < 0.05,
             colour=colour,
         )
-    ax.set_yticks(places, names, fontsize=7)
     counts = sorted({*table[variables.MODEL_SUBJECTS].values.tolist()})
     n = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
     ax.set_xlabel(

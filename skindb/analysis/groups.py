@@ -385,9 +385,8 @@ def plot_group_effects(table: Dataset, *, ax: Axes | None = None) -> Axes:
     one row per quantity.
     """
     names = table["quantity"].values.tolist()
-    ax = ax or plots.new_axes(6.5, 1.2 + 0.22 * len(names))
+    ax, places = plots.axes_of_rows(names, ax)
     ax.axvline(0, color="0.6", linewidth=1)
-    places = np.arange(len(names))[::-1]
     contrasts = table["contrast"].values.tolist()
     for i, contrast in enumerate(contrasts):
         part = table.sel(contrast=contrast)
@@ -411,8 +410,6 @@ def plot_group_effects(table: Dataset, *, ax: Axes | None = None) -> Axes:
             colour=colour,
             marker=marker,
         )
-    ax.set_yticks(places, names, fontsize=7)
-    ax.set_ylim(-0.6, len(names) - 0.4)
     adjusted = ", ".join(table.attrs["adjust"])
     held = f", {adjusted} held fixed" if adjusted else ""
     ax.set_xlabel(

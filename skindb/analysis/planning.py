@@ -209,11 +209,8 @@ def describe_plan(table: Dataset) -> list[str]:
 def plot_plan(table: Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot the number of subjects for each quantity."""
     names = table["quantity"].values.tolist()
-    ax = ax or plots.new_axes(6.5, 1.2 + 0.22 * len(names))
-    places = np.arange(float(len(names)))[::-1]
+    ax, places = plots.axes_of_rows(names, ax)
     ax.plot(table[variables.PLAN_SUBJECTS], places, "o", color=plots.BLUE)
-    ax.set_yticks(places, names, fontsize=7)
-    ax.set_ylim(-0.6, len(names) - 0.4)
     ax.set_xlim(left=0)
     ax.set_xlabel(
         f"subjects for a power of {100 * table.attrs['power']:g} %\n"

@@ -185,12 +185,9 @@ def describe_repeatability(table: Dataset) -> list[str]:
 def plot_repeatability(table: Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot the ICC of each quantity with its 95 % interval."""
     names = table["quantity"].values.tolist()
-    ax = ax or plots.new_axes(6.5, 1.2 + 0.22 * len(names))
-    places = np.arange(float(len(names)))[::-1]
+    ax, places = plots.axes_of_rows(names, ax)
     plots.intervals(ax, table, variables.ICC, places, fmt="o", color=plots.BLUE)
     count = int(table[variables.REPEAT_SUBJECTS].max())
-    ax.set_yticks(places, names, fontsize=7)
-    ax.set_ylim(-0.6, len(names) - 0.4)
     ax.set_xlim(min(0.0, *ax.get_xlim()), 1.02)
     ax.set_xlabel(f"ICC(1), 95 % CI (n = {count} subjects with repeated takes)")
     return ax
