@@ -10,17 +10,21 @@ from typing import Any
 
 import numpy as np
 from numpy.random import Generator
+from scipy.special import gammaln
 from xarray import Dataset
 
 from skindb.analysis.quantities import Quantities
 from skindb.analysis.subjects import (
     CONDITION,
+    EVEN,
+    LEVEL,
     NORMAL,
     Attribute,
     Subjects,
     attribute_of,
     comparable_takes,
     has_trait,
+    level_error,
     multiple_correlation,
     require_adjustable,
     subjects_of,
@@ -36,9 +40,13 @@ from skindb.numerics.inference import (
     permutation_p,
     sign_flip_p,
 )
+from skindb.numerics.statistics import ROUNDING, known_mean
 from skindb.parameters import ContrastParameters
-from skindb.types import Array, finite_rows
+from skindb.types import Array, Mask, finite_rows
 
+# below which a quantity shows errors more than subjects or their changes ("poor" in Koo
+# and Li 2016), and has no p values
+MIN_RELIABILITY = 0.5
 # subjects of a group, below which intervals depend on the assumption of normal values
 FEW = 10
 # multiple correlation from which an attribute counts as confounder: a quarter of the
@@ -65,10 +73,16 @@ class Contrast:
     quantities: Quantities  # of the subjects, or differences within subjects
     regressor: Array  # (n,) compared attribute; 1 for differences within subjects
     covariates: Array  # (n, c)
-    reliability: Array  # (q,) of the subjects, see `Quantities.reliability`
     is_number: bool = False  # whether the compared attribute is numeric
     # (n, q) values in the condition normal, for differences within subjects
     before: Array | None = None
+    # (q,) half-width of the 95 % interval of what even reflection may add to differences
+    even: Array | float = 0.0
+
+    @property
+    def reliability(self) -> Array:
+        """Reliability (q,) of the subjects, or of changes; see `Quantities.reliability`."""
+        return self.quantities.reliability(self.is_paired)
 
     @property
     def is_paired(self) -> bool:
@@ -122,11 +136,8 @@ def contrasts(
         carries = _carriers(everyone, subjects, trait)
         values = np.array([carries.get(name, np.nan) for name in names])
         regressors = {f"{trait} less others": values}
-    reliability = quantities.reliability
     return [
-        Contrast(
-            name, quantities, regressor, covariates, reliability, is_number
-        ).complete()
+        Contrast(name, quantities, regressor, covariates, is_number).complete()
         for name, regressor in regressors.items()
     ]
 
@@ -189,6 +200,24 @@ class Comparison:
     associated: dict[str, float]  # attribute -> multiple correlation
     flags: list[str]
 
+    @property
+    def smallest_p(self) -> float:
+        """The smallest p value that is possible with its number of permutations and subjects."""
+        contrast = self.contrast
+        smallest = 1 / (self.test.permutations + 1)
+        if contrast.is_paired:
+            # with all signs changed, the statistic has the same magnitude
+            return max(smallest, 2.0 ** (1 - len(contrast.regressor)))
+        if contrast.covariates.shape[1]:
+            return smallest
+        # permutations within a group change nothing
+        sizes = np.unique(contrast.regressor, return_counts=True)[1]
+        # exchanging both groups only changes the sign
+        mirrored = 2.0 if len(sizes) == 2 and sizes[0] == sizes[1] else 1.0
+        logarithm = gammaln(len(contrast.regressor) + 1)
+        logarithm -= sum(gammaln(size + 1) for size in sizes)
+        return max(smallest, mirrored / float(np.exp(logarithm)))
+
 
 def compare_groups(
     cohort: Dataset,
@@ -249,14 +278,20 @@ def _paired(
             continue
         after = changed.of_subjects(both)
         normal = plain.of_subjects(both)
+        errors = after.errors
+        if errors is not None and normal.errors is not None:
+            errors = np.hypot(errors, normal.errors)
+        changes = replace(after, values=after.values - normal.values, errors=errors)
+        of_both = np.isin(quantities.subject, both)
+        rows = [of_both & (conditions == word) for word in (NORMAL, name)]
         pairs.append(
             Contrast(
                 f"{name} less {NORMAL}",
-                replace(after, values=after.values - normal.values),
+                changes,
                 np.ones(len(both)),
                 np.empty((len(both), 0)),
-                normal.reliability,
                 before=normal.values,
+                even=_even_error(cohort, quantities, rows),
             )
         )
     require(
@@ -269,9 +304,33 @@ def _paired(
     return pairs
 
 
+def _even_error(cohort: Dataset, quantities: Quantities, rows: Sequence[Mask]) -> Array:
+    """Half-widths (q,) of the 95 % intervals of what even reflection may add to the
+    differences of takes in two conditions, given by their masks (take,).
+
+    Where both have the same prior, its error cancels, and what was subtracted differs by
+    a fraction of the change of the highlights, which is known to about itself. Errors of
+    different priors are taken as independent.
+    """
+    largest = np.nan_to_num(level_error(cohort))
+    error = 0.0
+    if largest > 0:
+        levels = np.nan_to_num(cohort[LEVEL].values.astype(float))
+        first, second = (levels[one].max() for one in rows)
+        error = float(np.hypot(first, second)) if first != second else 0.0
+    if EVEN in cohort.coords:
+        values = cohort[EVEN].values.astype(float)
+        first, second = (np.nan_to_num(known_mean(values[one])) for one in rows)
+        error = float(np.hypot(error, second - first))
+    error /= max(largest, ROUNDING)
+    return np.asarray(np.multiply(quantities.common, error))
+
+
 @dataclass(frozen=True)
 class ContrastTest:
-    """Effects on quantities (q,) with their p values by permutation."""
+    """Effects on quantities (q,) with their p values by permutation, NaN where errors
+    may cause the effect.
+    """
 
     effects: Effects
     p: Array
@@ -294,10 +353,21 @@ def contrast_test(
     values = np.where(able, values, np.float32(np.nan))
     draws: dict[str, Any] = {"max_draws": permutations, "rng": rng}
     if contrast.is_paired:
-        return ContrastTest(paired_effects(values), *sign_flip_p(values, **draws))
-    design = (contrast.regressor, contrast.covariates)
-    fit = effects(values, *design)
-    return ContrastTest(fit, *permutation_p(values, *design, **draws))
+        fit = paired_effects(values)
+        *found, count = sign_flip_p(values, **draws)
+        low, high = (
+            fit.slope + np.copysign(np.hypot(end - fit.slope, contrast.even), side)
+            for end, side in ((fit.low, -1), (fit.high, 1))
+        )
+        fit = replace(fit, low=low, high=high)
+    else:
+        design = (contrast.regressor, contrast.covariates)
+        fit = effects(values, *design)
+        *found, count = permutation_p(values, *design, **draws)
+    is_error = contrast.reliability < MIN_RELIABILITY
+    is_error |= np.abs(fit.slope) < contrast.even
+    p, adjusted = (np.where(is_error, np.nan, x) for x in found)
+    return ContrastTest(fit, p, adjusted, count)
 
 
 def contrast_counts(contrast: Contrast) -> Array:

@@ -15,6 +15,7 @@ from scipy import stats
 from xarray import Dataset
 
 from skindb import plots
+from skindb.analysis.contrasts import MIN_RELIABILITY
 from skindb.analysis.formulas import (
     SUBJECT,
     MixedModel,
@@ -55,6 +56,7 @@ COLUMNS = (
     variables.MODEL_ERROR,
     variables.MODEL_ESTIMATE_LOW,
     variables.MODEL_ESTIMATE_HIGH,
+    variables.MODEL_RELIABILITY,
     variables.MODEL_P,
     variables.MODEL_P_FALSE_DISCOVERY,
     variables.MODEL_P_EQUIVALENCE,
@@ -80,7 +82,9 @@ def linear_model(
         and visit, as of formulaic; perhaps with ``(1 | subject)``, with ``(1 + NAME |
         subject)`` for slopes that differ between subjects, or with ``(1 | subject/NAME)``
         for values of NAME that differ within them. Takes in other conditions
-        than normal are used if the formula names the condition. `baseline` is the value
+        than normal are used if the formula names ``condition``, or the condition
+        itself: ``lotion`` is then its dose, an attribute that is a number, and 0 in
+        the condition normal where it is not stated. `baseline` is the value
         of the subject's first take in the condition normal; the takes of that visit are
         no rows then. It is the logarithm if that of the quantity is explained.
     contrasts
@@ -99,6 +103,8 @@ def linear_model(
         Student's intervals and p values with the degrees of freedom between subjects
         for terms that are constant within subjects or have random slopes, within
         subjects for others, and between nested values for those constant within them.
+        Where the errors of the fits leave less than half of the variance between or
+        within subjects, there are no p values, except of equivalence.
         Terms of one number are per unit of it, those of words less the first word,
         where week 2 is before week 10, those of conditions less normal; contrasts
         follow them. Attribute "flags".
@@ -274,9 +280,10 @@ def _fit(
         raise input_error(
             "formula", "must be determined", "no maximum of the likelihood was found"
         ) from None
-    table = _inference(
-        (scale * estimate, scale**2 * covariance, free), terms, contrasts, margin
-    )
+    reliability = _reliability(rows, is_constant_within(x, subjects), model.is_log)
+    reliability[np.array(terms) == INTERCEPT] = np.nan
+    fitted = (scale * estimate, scale**2 * covariance, free, reliability)
+    table = _inference(fitted, terms, contrasts, margin)
     effects = [INTERCEPT, *model.slopes] if model.is_mixed else []
     size = np.sqrt((random**2).mean(axis=0))  # whatever the units of the slopes are
     if model.nested:
@@ -338,26 +345,48 @@ def information_of(
     return information
 
 
+def _reliability(rows: pd.DataFrame, is_between: Mask, is_log: bool) -> Array:
+    """Fraction (p,) of the variance between subjects that the errors of the fits leave,
+    for terms that are constant within them, and of that within subjects for others.
+    """
+    square = (rows["error"] / (np.exp(rows["value"]) if is_log else 1.0)) ** 2
+    values = rows["value"].groupby(rows[SUBJECT])
+    means = values.mean()
+    noise = (square.groupby(rows[SUBJECT]).mean() / values.count()).mean()
+    rest = ((rows["value"] - values.transform("mean")) ** 2).sum()
+    free = len(rows) - len(means)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        within = 1 - np.float64(square.mean()) * free / rest
+        between = 1 - np.float64(noise) / means.var()
+    return np.asarray(np.maximum(np.where(is_between, between, within), 0.0))
+
+
 def _inference(
-    fitted: tuple[Array, Array, Array],
+    fitted: tuple[Array, Array, Array, Array],
     terms: Sequence[str],
     contrasts: Sequence[str],
     margin: float | None,
 ) -> pd.DataFrame:
-    """Variables of terms and contrasts, from estimates, covariance and degrees of freedom."""
-    estimate, covariance, free = fitted
+    """Variables of terms and contrasts, from estimates, covariance, degrees of freedom
+    and reliability.
+    """
+    estimate, covariance, free, reliability = fitted
     contrasts = [name for name in dict.fromkeys(contrasts) if name not in terms]
     sums = np.vstack([np.eye(len(terms)), *(sum_of(name, terms) for name in contrasts)])
     estimate = sums @ estimate
     error = np.sqrt(np.einsum("ij,jk,ik->i", sums, covariance, sums))
     free = np.where(sums != 0, free, np.inf).min(axis=1)
+    # of the term that is known worst; NaN, where it is unknown, is ignored
+    reliability = np.fmin.reduce(np.where(sums != 0, reliability, np.nan), axis=1)
+    p = 2 * stats.t.sf(np.abs(estimate / error), free)
     half = stats.t.ppf(0.975, free) * error
     columns = {
         variables.MODEL_ESTIMATE: estimate,
         variables.MODEL_ERROR: error,
         variables.MODEL_ESTIMATE_LOW: estimate - half,
         variables.MODEL_ESTIMATE_HIGH: estimate + half,
-        variables.MODEL_P: 2 * stats.t.sf(np.abs(estimate / error), free),
+        variables.MODEL_RELIABILITY: reliability,
+        variables.MODEL_P: np.where(reliability < MIN_RELIABILITY, np.nan, p),
         variables.MODEL_DEGREES_OF_FREEDOM: free,
     }
     if margin is not None:
@@ -424,7 +453,6 @@ def _solve(
 
 
 def _labelled(
-    model: MixedModel,
     fits: dict[str, _Fit],
     flags: list[str],
     cohort: Dataset,
@@ -443,6 +471,8 @@ def _labelled(
         discovered[is_known, column] = stats.false_discovery_control(
             p[is_known, column]
         )
+    if (values[variables.MODEL_RELIABILITY] < MIN_RELIABILITY).any():
+        flags.append(f"no p values where the reliability is below {MIN_RELIABILITY}")
     effects = list(next(iter(fits.values())).deviation)
     return dataset(
         values

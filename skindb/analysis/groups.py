@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import stats
-from scipy.special import gammaln
 from xarray import Dataset
 
 from skindb import plots
 from skindb.analysis.colour import colour_difference
 from skindb.analysis.contrasts import (
+    MIN_RELIABILITY,
     Comparison,
     Contrast,
     compare_groups,
@@ -45,9 +45,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SIGNIFICANT = 0.05  # of adjusted p values
-# below which a quantity shows errors more than subjects ("poor" in Koo and Li 2016), and
-# has no p values
-MIN_RELIABILITY = 0.5
 MAX_LISTED = 6  # detectable differences that are named in a line
 SIDES = ("with", "without")
 COLUMNS = (
@@ -103,12 +100,14 @@ def group_effects(
         interval, also in per cent and in standard deviations; p values (unadjusted,
         adjusted by the largest statistic, and by the false discovery rate); and the
         smallest detectable effect; and the reliability, the fraction of the variance
-        between subjects that the errors of the fits and the differences between
-        repeated takes leave: where it is below 0.5, there are no p values between
-        subjects. sigma_tr is compared by its logarithm. NaN where too few subjects have
-        a quantity. R_d may be wrong by the same amount in all takes (even reflection):
-        this cancels in differences, and the intervals in per cent include it. Attribute
-        "flags": small or missing groups, confounded attributes, and low reliability.
+        between subjects, or of the mean square of changes within them, that the errors
+        of the fits and the differences between repeated takes leave: where it is below
+        0.5, there are no p values. sigma_tr is compared by its logarithm. NaN where too
+        few subjects have a quantity. R_d may be wrong by the same amount in all takes
+        (even reflection): this cancels in differences, and the intervals in per cent
+        include it. Where conditions have other surfaces, intervals contain the error of
+        both, and effects within this error have no p values. Attribute "flags": small
+        or missing groups, confounded attributes, and low reliability.
 
     Raises
     ------
@@ -151,7 +150,7 @@ def group_effects(
             "group_by": group_by,
             "adjust": list(adjust),
             "permutations": [comparison.test.permutations for comparison in compared],
-            "smallest_p": [_smallest_p(comparison) for comparison in compared],
+            "smallest_p": [comparison.smallest_p for comparison in compared],
             "logarithmic": list(itertools.compress(measured.names, measured.is_log)),
             "flags": flags + notes_on_attributes(subjects_of(cohort)),
             "skipped": skipped_takes(cohort),
@@ -164,8 +163,7 @@ def _statistics(comparison: Comparison) -> dict[str, Array]:
     contrast = comparison.contrast
     test = comparison.test
     fit = test.effects
-    is_low = _is_unreliable(contrast)
-    p, p_adjusted = (np.where(is_low, np.nan, x) for x in (test.p, test.p_adjusted))
+    p = test.p
     percent, low, high = _percent(fit, _reference(contrast, fit), contrast.quantities)
     discovered = np.full(len(p), np.nan)
     discovered[np.isfinite(p)] = stats.false_discovery_control(p[np.isfinite(p)])
@@ -173,7 +171,7 @@ def _statistics(comparison: Comparison) -> dict[str, Array]:
         fit.slope, fit.spread, out=np.full_like(fit.slope, np.nan), where=fit.spread > 0
     )
     detectable = np.full_like(fit.error, np.nan)
-    if _smallest_p(comparison) < SIGNIFICANT:
+    if comparison.smallest_p < SIGNIFICANT:
         detectable = detectable_difference(fit.error, fit.free)
     return {
         variables.EFFECT_COUNT: contrast_counts(contrast),
@@ -185,21 +183,12 @@ def _statistics(comparison: Comparison) -> dict[str, Array]:
         variables.EFFECT_PERCENT_HIGH: high,
         variables.EFFECT_STANDARDISED: standardised,
         variables.EFFECT_P: p,
-        variables.EFFECT_P_ADJUSTED: p_adjusted,
+        variables.EFFECT_P_ADJUSTED: test.p_adjusted,
         variables.EFFECT_P_FALSE_DISCOVERY: discovered,
         variables.EFFECT_DETECTABLE: detectable,
         variables.EFFECT_RELIABILITY: contrast.reliability,
         variables.ATTRIBUTE_ASSOCIATION: np.array(list(comparison.associated.values())),
     }
-
-
-def _is_unreliable(contrast: Contrast) -> Array:
-    """Quantities (q,) that show errors more than subjects; changes within subjects do
-    not depend on how much these differ.
-    """
-    if contrast.is_paired:
-        return np.zeros(len(contrast.quantities.names), bool)
-    return np.asarray(contrast.reliability < MIN_RELIABILITY)
 
 
 def _reference(contrast: Contrast, fit: Effects) -> Array:
@@ -214,24 +203,6 @@ def _reference(contrast: Contrast, fit: Effects) -> Array:
         return known_mean(values)
     centre = known_mean(np.where(is_known, contrast.regressor[:, None], np.nan))
     return np.asarray(known_mean(values) - fit.slope * centre)
-
-
-def _smallest_p(comparison: Comparison) -> float:
-    """The smallest p value that is possible with its number of permutations and subjects."""
-    contrast = comparison.contrast
-    smallest = 1 / (comparison.test.permutations + 1)
-    if contrast.is_paired:
-        # with all signs changed, the statistic has the same magnitude
-        return max(smallest, 2.0 ** (1 - len(contrast.regressor)))
-    if contrast.covariates.shape[1]:
-        return smallest
-    # permutations within a group change nothing
-    sizes = np.unique(contrast.regressor, return_counts=True)[1]
-    # exchanging both groups only changes the sign
-    mirrored = 2.0 if len(sizes) == 2 and sizes[0] == sizes[1] else 1.0
-    logarithm = gammaln(len(contrast.regressor) + 1)
-    logarithm -= sum(gammaln(size + 1) for size in sizes)
-    return max(smallest, mirrored / float(np.exp(logarithm)))
 
 
 def _percent(
@@ -263,20 +234,23 @@ def _flags(comparison: Comparison, statistics: dict[str, Array]) -> list[str]:
     contrast = comparison.contrast
     flags = comparison.flags + _surface_flag(contrast, statistics)
     flags += _colour_flag(contrast)
-    reliability = statistics[variables.EFFECT_RELIABILITY]
     names = contrast.quantities.names
-    if low := [
-        f"{name} {value:.2f}"
-        for name, value, is_low in zip(
-            names, reliability, _is_unreliable(contrast), strict=True
-        )
-        if is_low
-    ]:
-        flags.append(
-            f"{contrast.name}: no p values where the reliability is below "
-            f"{MIN_RELIABILITY}: {', '.join(low)}"
-        )
-    smallest = _smallest_p(comparison)
+    reliability = statistics[variables.EFFECT_RELIABILITY]
+    is_even = np.abs(statistics[variables.EFFECT]) < contrast.even
+    for values, where, reason in (
+        (
+            reliability,
+            reliability < MIN_RELIABILITY,
+            f"the reliability is below {MIN_RELIABILITY}",
+        ),
+        (statistics[variables.EFFECT], is_even, "even reflection may cause the effect"),
+    ):
+        low = [f"{names[i]} {values[i]:.2g}" for i in np.flatnonzero(where)]
+        if low:
+            flags.append(
+                f"{contrast.name}: no p values where {reason}: {', '.join(low)}"
+            )
+    smallest = comparison.smallest_p
     if smallest >= SIGNIFICANT:
         flags.append(
             f"{contrast.name}: with {len(contrast.regressor)} subjects no p value can be "
@@ -312,7 +286,8 @@ def _surface_flag(contrast: Contrast, statistics: dict[str, Array]) -> list[str]
     names = np.array(contrast.quantities.names)
     differ = statistics[variables.EFFECT_P_ADJUSTED] < SIGNIFICANT
     small = differ & (np.abs(statistics[variables.EFFECT]) < contrast.quantities.common)
-    if not (differ & np.char.startswith(names, SURFACE)).any() or not small.any():
+    differs = (differ & np.char.startswith(names, SURFACE)).any()
+    if contrast.is_paired or not differs or not small.any():
         return []
     limit = max(contrast.quantities.common)
     note = f"differences of R_d up to {limit:.2g} may be due to its even reflection"

@@ -11,9 +11,16 @@ import numpy as np
 import xarray as xr
 from xarray import Dataset
 
-from skindb.analysis.contrasts import Comparison, compare_groups, contrast_arguments
+from skindb.analysis.contrasts import (
+    MIN_RELIABILITY,
+    Comparison,
+    compare_groups,
+    contrast_arguments,
+)
 from skindb.analysis.groups import SIGNIFICANT
 from skindb.analysis.quantities import (
+    NORMAL_95,
+    REFLECTANCE,
     SURFACE,
     Quantities,
     Quantity,
@@ -29,7 +36,7 @@ from skindb.analysis.study import (
     skipped_takes,
     table_of,
 )
-from skindb.analysis.subjects import notes_on_attributes, subjects_of
+from skindb.analysis.subjects import level_error, notes_on_attributes, subjects_of
 from skindb.errors import Fault, InputError, require
 from skindb.parameters import ContrastParameters, permutations_option
 from skindb.schema import dataset, variables
@@ -127,7 +134,7 @@ def effect_maps(
     return result.assign_attrs(
         group_by=group_by,
         adjust=list(adjust),
-        permutations=parts[-1].attrs["permutations"],
+        **parts[-1].attrs,
         logarithmic=[name for name in names if name.startswith(LOGARITHMIC)],
         flags=[
             *dict.fromkeys(flags),
@@ -152,6 +159,7 @@ def _quantity_maps(
         compared, undetermined = compare(measure)
         flags += [flag for comparison in compared for flag in comparison.flags]
         name = quantity.name
+        flags += [flag for one in compared for flag in _reliability_flags(one, name)]
         faults += [replace(f, where=f"{f.where}, {name}") for f in undetermined]
         if not compared:
             continue
@@ -163,6 +171,23 @@ def _quantity_maps(
         else:
             parts.append(maps)
     return parts, flags, faults
+
+
+def _reliability_flags(comparison: Comparison, name: str) -> list[str]:
+    """What is known of the errors of the texels of a quantity."""
+    if name == LOGARITHMIC:
+        return [
+            f"{name}: no p values of texels between the probe sites, where it is interpolated"
+        ]
+    reliability = comparison.contrast.reliability
+    known = np.isfinite(reliability)
+    if not known.any():
+        return [
+            "without repeats of three subjects, the reliability of texels is unknown"
+        ]
+    low = np.mean(reliability[known] < MIN_RELIABILITY)
+    text = f"{low:.0%} of the texels have no p values: the reliability is below {MIN_RELIABILITY}"
+    return [f"{comparison.contrast.name}, {name}: {text}"]
 
 
 def _arranged(compared: Sequence[Comparison], quantity: Quantity, size: int) -> Dataset:
@@ -184,6 +209,8 @@ def _arranged(compared: Sequence[Comparison], quantity: Quantity, size: int) -> 
             (variables.MAP_EFFECT_P_ADJUSTED, test.p_adjusted),
             (variables.MAP_EFFECT_COUNT, is_known.sum(axis=0)),
         ):
+            if "_p" in variable and quantity.name == LOGARITHMIC:
+                texels = np.full_like(texels, np.nan)
             maps = np.float32(texels).reshape(size, size, len(titles))
             statistics.setdefault(variable, []).append(np.moveaxis(maps, -1, 0))
     return dataset(
@@ -192,7 +219,10 @@ def _arranged(compared: Sequence[Comparison], quantity: Quantity, size: int) -> 
             "contrast": [comparison.contrast.name for comparison in compared],
             "quantity": titles,
         },
-        attrs={"permutations": [c.test.permutations for c in compared]},
+        attrs={
+            "permutations": [c.test.permutations for c in compared],
+            "smallest_p": [c.smallest_p for c in compared],
+        },
     )
 
 
@@ -207,7 +237,11 @@ def _texel_quantities(takes: Dataset, *, quantity: Quantity, size: int) -> Quant
     )
     names = [quantity.mapped, variables.TEXEL_COVERAGE]
     values = np.stack(each_take(_block_means, takes, names, quantity, size))
-    return Quantities(values, tuple(map(str, takes["subject"].values)))
+    common = 0.0
+    if quantity == REFLECTANCE:
+        common = NORMAL_95 * float(np.nan_to_num(level_error(takes)))
+    subject = tuple(map(str, takes["subject"].values))
+    return Quantities(values, subject, common=(common,))
 
 
 def _block_means(take: Dataset, quantity: Quantity, size: int) -> Array:
@@ -233,7 +267,8 @@ def tabulate_effect_maps(maps: Dataset) -> Table:
     mean and largest effect.
     """
     texel = ("v", "u")
-    is_known = maps[variables.MAP_EFFECT_P].notnull()
+    is_known = maps[variables.MAP_EFFECT_HALF_WIDTH].notnull()
+    is_tested = maps[variables.MAP_EFFECT_P].notnull()
     effect = maps[variables.MAP_EFFECT].where(is_known).astype(float)
     differs = maps[variables.MAP_EFFECT_P_ADJUSTED] < SIGNIFICANT
     count = maps[variables.MAP_EFFECT_COUNT].where(is_known, 0)
@@ -242,7 +277,7 @@ def tabulate_effect_maps(maps: Dataset) -> Table:
     columns = {
         "subjects": count.max(texel).astype(int),
         "texels": is_known.sum(texel),
-        "fraction_that_differs": differs.where(is_known).mean(texel),
+        "fraction_that_differs": differs.where(is_tested).mean(texel),
         "mean_effect": effect.mean(texel),
         "largest_effect": high.where(high >= -low, low),
     }
@@ -251,11 +286,15 @@ def tabulate_effect_maps(maps: Dataset) -> Table:
 
 def describe_effect_maps(maps: Dataset) -> list[str]:
     """Notes on the table, one line each."""
+    names = maps["contrast"].values.tolist()
     counts = zip(
-        maps["contrast"].values.tolist(), maps.attrs["permutations"], strict=True
+        names, maps.attrs["permutations"], maps.attrs["smallest_p"], strict=True
     )
     note = "p values are adjusted for all texels of a variable by the largest statistic"
-    lines = [f"{name}: {note}; {count} permutations" for name, count in counts]
+    lines = [
+        f"{name}: {note}; {count} permutations, the smallest possible p is {smallest:.2g}"
+        for name, count, smallest in counts
+    ]
     if maps.attrs["logarithmic"]:
         lines.append("effects of sigma_tr are differences of its natural logarithm")
     return [*lines, *maps.attrs["flags"]]
@@ -285,7 +324,10 @@ def plot_effect_maps(maps: Dataset, *, contrast: str | None = None) -> Figure:
         len(quantities), 3, figsize=(9, 2.9 * len(quantities)), squeeze=False
     )
     known = (
-        part[variables.MAP_EFFECT_P].sel(quantity=quantities).notnull().any("quantity")
+        part[variables.MAP_EFFECT_HALF_WIDTH]
+        .sel(quantity=quantities)
+        .notnull()
+        .any("quantity")
     )
     for dim, other in (("v", "u"), ("u", "v")):
         places = np.flatnonzero(known.any(other))
@@ -304,7 +346,7 @@ def _plot_quantity(line: Sequence[Axes], maps: Dataset) -> None:
     quantity = str(maps["quantity"].values)
     is_logarithm = quantity in maps.attrs["logarithmic"]
     unit = "change of the logarithm" if is_logarithm else "difference"
-    maps = maps.where(maps[variables.MAP_EFFECT_P].notnull())
+    maps = maps.where(maps[variables.MAP_EFFECT_HALF_WIDTH].notnull())
     size = abs(maps[variables.MAP_EFFECT])
     half_width = maps[variables.MAP_EFFECT_HALF_WIDTH]
     largest, widest = (

@@ -142,7 +142,7 @@ class Quantities:
     names: tuple[str, ...] = ()  # (q,) for example "R_d face G"; none of texels
     is_log: tuple[bool, ...] = ()  # (q,)
     # (q,) half-width of the 95 % interval of an error that all takes have in common
-    common: tuple[float, ...] = ()
+    common: tuple[float, ...] = (0.0,)
     # (n, q) standard errors of the values, without what all takes have in common
     errors: Array | None = None
 
@@ -153,30 +153,33 @@ class Quantities:
             np.array([name == subject for subject in self.subject]) for name in names
         ]
         values = np.stack([known_mean(self.values[rows]) for rows in takes])
-        errors = None
-        if self.errors is not None:
+        repeated = _within_deviation(self.values, takes)
+        errors = self.errors
+        if errors is not None or np.isfinite(repeated).any():
             count = np.stack(
                 [np.isfinite(self.values[rows]).sum(axis=0) for rows in takes]
             )
-            repeated = _within_deviation(self.values, takes) / np.sqrt(
-                np.maximum(count, 1)
-            )
-            errors = np.stack([_mean_error(self.errors[rows]) for rows in takes])
-            errors = np.fmax(errors, repeated)
+            repeated = repeated / np.sqrt(np.maximum(count, 1))
+            stated: Array | float = np.nan
+            if errors is not None:
+                stated = np.stack([_mean_error(errors[rows]) for rows in takes])
+            errors = np.fmax(stated, repeated)
         return replace(self, values=values, subject=names, errors=errors)
 
-    @property
-    def reliability(self) -> Array:
-        """Fraction (q,) of the variance between these subjects that their errors leave;
-        NaN without errors or for fewer than three subjects.
+    def reliability(self, of_changes: bool) -> Array:
+        """Fraction (q,) of the variance between these subjects, or of the mean square of
+        changes within them, that their errors leave; NaN without errors or for fewer
+        than three subjects.
         """
         if self.errors is None:
             return np.full(self.values.shape[1], np.nan)
         moments = Moments.of(self.values)
+        # a change of all subjects by the same amount is not an error; the mean square does
+        # not depend on signs, so that those that permutations change decide no p value
+        total = known_mean(self.values**2) if of_changes else moments.variance
         error = known_mean(np.where(np.isfinite(self.values), self.errors, np.nan) ** 2)
-        is_known = (moments.count >= MIN_SUBJECTS) & (moments.variance > 0)
-        fraction = 1 - error / np.where(is_known, moments.variance, np.nan)
-        return np.maximum(fraction, 0.0)
+        is_known = (moments.count >= MIN_SUBJECTS) & (total > 0)
+        return np.maximum(1 - error / np.where(is_known, total, np.nan), 0.0)
 
     def select(self, rows: Sequence[int] | Index) -> Quantities:
         """The quantities of the takes or subjects with these indices."""
@@ -195,10 +198,13 @@ def _within_deviation(values: Array, takes: Sequence[Mask]) -> Array:
     """Standard deviation (q,) of the takes of one subject, from values (n, q); NaN where
     fewer than three subjects have two.
     """
-    of_subjects = [Moments.of(values[rows]) for rows in takes]
-    second = sum(moments.second for moments in of_subjects)
-    free = sum(np.maximum(moments.count - 1, 0) for moments in of_subjects)
-    repeated = sum(moments.count > 1 for moments in of_subjects)
+    second, free, repeated = np.zeros((3, values.shape[1]))
+    for rows in takes:
+        if rows.sum() > 1:
+            moments = Moments.of(values[rows])
+            second += moments.second
+            free += np.maximum(moments.count - 1, 0)
+            repeated += moments.count > 1
     variance = second / np.maximum(free, 1)
     return np.asarray(np.where(repeated >= MIN_SUBJECTS, np.sqrt(variance), np.nan))
 

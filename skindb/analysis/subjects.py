@@ -34,6 +34,7 @@ OTHER = "other conditions"
 NO_ATTRIBUTES = ("take", "subject", "visit", "repeat", "session", "model_generation")
 # coordinate of the error of R_d that all channels of a take share
 LEVEL = "fit_even_reflection_error"
+EVEN = "fit_even_reflection"  # what was subtracted from R_d of a take
 FIT = "fit_"  # prefix of coordinates that are parameters of the fit
 
 

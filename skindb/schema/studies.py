@@ -307,7 +307,7 @@ EFFECT_DETECTABLE = declare(
 EFFECT_RELIABILITY = declare(
     "float64 effects/effect_reliability(contrast, quantity) [1]",
     "fraction of the variance between subjects that the errors of the fits and repeated takes "
-    "leave; of the takes in the condition normal where conditions are compared",
+    "leave; of the mean square of the changes where conditions are compared",
 )
 ATTRIBUTE_ASSOCIATION = declare(
     "float64 effects/attribute_association(contrast, attribute) [1]",
@@ -382,6 +382,11 @@ MODEL_ESTIMATE_LOW = declare(
 MODEL_ESTIMATE_HIGH = declare(
     "float64 linear_model/model_estimate_high(quantity, term) [1]",
     "upper end of the 95 % interval of the coefficient",
+)
+MODEL_RELIABILITY = declare(
+    "float64 linear_model/model_reliability(quantity, term) [1]",
+    "fraction of the variance that the errors of the fits leave: between subjects for terms "
+    "that are constant within them, within subjects for others",
 )
 MODEL_P = declare(
     "float64 linear_model/model_p(quantity, term) [1]",

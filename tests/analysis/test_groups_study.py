@@ -385,28 +385,74 @@ def test_group_effects__reliability_is_what_was_planted(stated, repeat, reliabil
     assert np.isfinite(effects["effect_p"].sel(quantity="R_d face R"))
 
 
-@pytest.mark.parametrize("stated", [0.015, 0.027])
+@pytest.mark.parametrize("stated", [0.0002, 0.005])
 def test_group_effects__reliability_and_colour_of_conditions(stated):
-    """Changes within subjects have p values even where subjects cannot be compared."""
+    """Changes that are not larger than their errors have no p values, whatever subjects
+    differ by.
+    """
     names = [f"S{i}" for i in range(30)]
-    cohort = planted_tables(names * 2, conditions=["normal"] * 30 + ["lotion"] * 30)
+    conditions = ["normal"] * 30 + ["tan"] * 30
+    cohort = planted_tables(
+        names * 2, conditions=conditions, albedo=[0.0] * 30 + [-0.004] * 30
+    )
     dims = ("take", "region", "channel")
     error = np.full(cohort["region_diffuse_reflectance"].shape, stated)
     cohort = cohort.assign(region_diffuse_reflectance_error=(dims, error))
     effects = group_effects(
         cohort, group_by="condition", permutations=200, rng=np.random.default_rng(0)
     )
-    rows = tidy(cohort.assign_coords(take=[*names, *(f"{s}.lotion" for s in names)]))
+    rows = tidy(cohort.assign_coords(take=[*names, *(f"{s}.tan" for s in names)]))
     means = rows[rows.quantity == "delta E"].groupby("region").value.mean()
     said = f"larger: face {means.face:.2g}, beard {means.beard:.2g}"
     assert any(flag.endswith(said) for flag in effects.attrs["flags"])
     effects = effects.isel(contrast=0)
-    normal = cohort["region_diffuse_reflectance"].values[:30, 0, 1]
-    expected = 1 - stated**2 / normal.var(ddof=1)
+    normal, tanned = np.split(cohort["region_diffuse_reflectance"].values[:, 0, 1], 2)
+    expected = max(1 - 2 * stated**2 / ((tanned - normal) ** 2).mean(), 0)
     reliability = effects["effect_reliability"].sel(quantity="R_d face G")
     assert float(reliability) == pytest.approx(expected)
-    assert np.isfinite(effects["effect_p"].sel(quantity="R_d face G"))
+    p = effects["effect_p"].sel(quantity="R_d face G")
+    assert np.isnan(p) == (stated == 0.005)
     # without stated errors it is unknown, and p values remain
     name = "surface reflectance face"
     assert np.isnan(effects["effect_reliability"].sel(quantity=name))
     assert np.isfinite(effects["effect_p"].sel(quantity=name))
+
+
+def _unlike_surfaces(after, change):
+    """20 subjects with lotion, whose even reflection is known to `after`; R_d changes."""
+    names = [f"S{i}" for i in range(20)]
+    cohort = planted_tables(
+        names * 2,
+        conditions=["normal"] * 20 + ["lotion"] * 20,
+        albedo=[0.0] * 20 + [change] * 20,
+        fit_even_reflection=[0.01] * 20 + [0.008] * 20,
+    )
+    error = np.repeat([0.01, after], 20)
+    cohort = cohort.assign_coords(fit_even_reflection_error=("take", error))
+    return _compare(cohort, "condition", quantities=["R_d", "ITA"]).isel(contrast=0)
+
+
+@pytest.mark.parametrize(
+    ("after", "change", "is_withheld"),
+    [
+        # errors of two priors: 1.96 hypot(0.01, 0.02, 0.002)
+        (0.02, 0.03, True),
+        (0.02, 0.06, False),
+        # one prior, whose error cancels: 1.96 x 0.002
+        (0.01, 0.003, True),
+        (0.01, 0.01, False),
+    ],
+)
+def test_group_effects__of_conditions_contain_even_reflection(
+    after, change, is_withheld
+):
+    found = _unlike_surfaces(after, change)
+    error = 0.002 if after == 0.01 else np.hypot(np.hypot(0.01, 0.02), 0.002)
+    one = found.sel(quantity=FACE_R)
+    half = float(one["effect_high"] - one["effect_low"]) / 2
+    # beside the scatter of 20 differences, 0.0013
+    assert half == pytest.approx(np.hypot(1.96 * error, 0.0013), rel=0.1)
+    assert np.isnan(one["effect_p"]) == is_withheld
+    assert np.isnan(found["effect_p"].sel(quantity="ITA face")) == is_withheld
+    flags = " ".join(found.attrs["flags"])
+    assert ("where even reflection may cause the effect: R_d" in flags) == is_withheld

@@ -75,9 +75,10 @@ def test_effect_maps__find_the_planted_patch_and_nothing_else():
     effect = found["map_effect"].sel(quantity="R_d G").values
     # 0.05 of the level differs between subjects
     assert effect[PATCH].mean() == pytest.approx(-STEP, abs=0.06)
-    np.testing.assert_allclose(
-        found["map_effect"].sel(quantity="sigma_tr R").mean(), np.log(1.5), atol=0.01
-    )
+    sigma_tr = found.sel(quantity="sigma_tr R")
+    np.testing.assert_allclose(sigma_tr["map_effect"].mean(), np.log(1.5), atol=0.01)
+    # it is interpolated between a few sites
+    assert sigma_tr["map_effect_p"].isnull().all()
     assert (found["map_effect_count"] == 24).all()
 
 
@@ -183,6 +184,31 @@ def test_effect_maps__refuses_what_cannot_be():
         maps_of(cohort(8), size=24)
     with pytest.raises(InputError, match="two groups"):
         maps_of(cohort(8).isel(take=slice(0, None, 2)))
+
+
+def test_effect_maps__texels_that_repeats_do_not_confirm_have_no_p_values():
+    """Six subjects, three times: texels differ by 0.05 between subjects in a half and by
+    0.2 between takes in the other.
+    """
+    ds = cohort(18).drop_vars("texel_sigma_tr")
+    own = np.repeat([f"S{i}" for i in range(6)], 3)
+    rng = np.random.default_rng(2)
+    noise = np.where(np.arange(SIZE) < SIZE // 2, 0.002, 0.2)[:, None, None]
+    values = np.repeat(0.05 * rng.standard_normal((6, SIZE, SIZE, 3)), 3, axis=0)
+    values += noise * rng.standard_normal(values.shape)
+    ds = ds.assign_coords(
+        subject=("take", own),
+        gender=("take", np.repeat(["f", "m"], 9)),
+    ).assign(texel_diffuse_reflectance=ds["texel_diffuse_reflectance"] * 0 + values)
+    found = maps_of(ds).isel(contrast=0).sel(quantity="R_d G")
+    has_p = found["map_effect_p"].notnull().mean("u")
+    assert (has_p[: SIZE // 2] == 1).all()
+    # a reliability above 0.5 by chance: of 6 subjects with the variances 0.05^2 and 0.2^2 / 3
+    assert has_p[SIZE // 2 :].mean() < 0.3
+    text = " ".join(found.attrs["flags"])
+    assert "of the texels have no p values: the reliability is below 0.5" in text
+    plain = maps_of(cohort(8)).attrs["flags"]
+    assert any("reliability of texels is unknown" in flag for flag in plain)
 
 
 def test_effect_maps__table_and_plot(tmp_path):
