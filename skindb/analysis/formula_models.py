@@ -130,8 +130,12 @@ def linear_model(
     known = [name for name in frame.columns if name not in unused]
     used = names_of(model, known)
     frame = frame[frame["quantity"] == model.quantity]
+    doses = sorted({*used} & {*frame[CONDITION]})
+    is_normal = frame[CONDITION] == NORMAL
+    for name in doses:
+        frame[name] = frame[name].where(frame[name].notna() | ~is_normal, 0.0)
     if CONDITION not in used:
-        frame = frame[frame[CONDITION] == NORMAL]
+        frame = frame[is_normal | frame[CONDITION].isin(doses)]
     measured = frame.dropna(subset=["value"])
     if model.is_log:
         numbers = frame[["value", BASELINE]]
@@ -165,8 +169,9 @@ def linear_model(
         if any(WITHOUT in reason for reason in reasons)
         else "use fewer terms, or add takes",
     )
-    stated = {"formula": formula, "margin": margin}
-    return _labelled(model, fits, flags, cohort, stated)
+    compared = "" if CONDITION in used else ", ".join([NORMAL, *doses])
+    stated = {"formula": formula, "margin": margin, "condition": compared}
+    return _labelled(fits, flags, cohort, stated)
 
 
 def _flags(model: MixedModel, measured: pd.DataFrame, used: pd.DataFrame) -> list[str]:
@@ -487,7 +492,6 @@ def _labelled(
         coords={"quantity": list(fits), "term": terms, "effect": effects},
         attrs={
             **stated,
-            "condition": "" if CONDITION in model.names else NORMAL,
             "flags": flags,
             "skipped": skipped_takes(cohort),
         },

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import MISSING, dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 SIGNIFICANT = 0.05
 MAX_SUBJECTS = 10_000
 MAX_VISITS = 100
-PEOPLE = 2  # subjects of a design, which stand for all
+MAX_DOSES = 10
 PARALLEL = "parallel"
 Design = Literal["parallel", "crossover"]
 COLUMNS = (
@@ -59,6 +60,8 @@ def sample_sizes(
     power: float = 0.8,
     visits: int = 1,
     design: Design = "parallel",
+    doses: int = 1,
+    drop_out: float = 0.0,
 ) -> Dataset:
     """Numbers of subjects with which a model finds an effect.
 
@@ -68,8 +71,8 @@ def sample_sizes(
         ``db.cohort("tables")`` with several visits of subjects in the condition normal,
         from whose first takes the variances between and within subjects come.
     formula
-        As in `linear_model`, of `treatment` (0 or 1) and `visit` (1, 2, ...), with ``(1 |
-        subject)``.
+        As in `linear_model`, of `treatment` (0, 1, ... `doses`) and `visit` (1, 2, ...),
+        with ``(1 | subject)``.
     term
         Term of the formula, or a sum of multiples of terms.
     effect
@@ -79,15 +82,19 @@ def sample_sizes(
     visits
         Visits of each subject.
     design
-        "parallel": half of the subjects are treated; "crossover": each subject is
-        measured with and without treatment at every visit.
+        "parallel": each subject has one dose; "crossover": each subject is measured
+        with all doses, of which 0 is no treatment, at every visit.
+    doses
+        Largest dose.
+    drop_out
+        Fraction of the subjects who leave the study before any visit.
 
     Returns
     -------
     Dataset
         (quantity,), see the variables of the group "plan": subjects of both arms
-        together, rounded up to pairs in parallel designs, NaN for more than 10,000; and
-        the standard error of the term with as many. Attribute "flags" of the variances.
+        together, rounded up to equal arms in parallel designs, NaN for more than 10,000; and
+        the standard error of the term with those who stay. Attribute "flags" of the variances.
 
     Raises
     ------
@@ -100,7 +107,9 @@ def sample_sizes(
     Noncentral t with the degrees of freedom of `linear_model`; Fitzmaurice, Laird and
     Ware 2011, chapter 20.
     """
-    require_limits(Parameters(formula, term, effect, power, visits, design))
+    require_limits(
+        Parameters(formula, term, effect, power, visits, design, doses, drop_out)
+    )
     model = MixedModel.of(formula)
     names_of(model, [SUBJECT, "treatment", "visit"])
     require(effect != 0, "effect", "must differ from 0", "0", "give another value")
@@ -110,7 +119,8 @@ def sample_sizes(
         "must have (1 | subject), without slopes or nesting",
         "another random part",
     )
-    rows = _design(visits, design)
+    rows = _design(visits, design, doses)
+    people = rows[SUBJECT].nunique()
     x, terms, _ = design_of(model, rows)
     require(
         np.linalg.matrix_rank(x) == len(terms),
@@ -126,7 +136,8 @@ def sample_sizes(
     )
     deviations = known[variables.MODEL_DEVIATION].sel(effect=[INTERCEPT, RESIDUAL])
     factors = sum_of(term, terms)
-    counts = np.arange(PEOPLE, MAX_SUBJECTS + 1, PEOPLE if design == PARALLEL else 1)
+    step = people if design == PARALLEL else 1
+    counts = np.arange(people, MAX_SUBJECTS + 1, step)
     free = _degrees_of_freedom(x, rows, factors, counts)
     needed, errors = [], []
     for between, within in deviations.values:
@@ -134,9 +145,10 @@ def sample_sizes(
         variances = (np.full((1, 1), between**2), [within**2])
         information = information_of(x, np.ones((len(rows), 1)), [subjects], *variances)
         variance = factors @ np.linalg.solve(information, factors)
-        error = np.sqrt(variance * PEOPLE / counts)
+        error = np.sqrt(variance * people / counts)
         enough = np.flatnonzero(_power(effect / error, free) >= power)
-        needed.append(counts[enough[0]] if len(enough) else np.nan)
+        arms = counts[enough[0]] / step if len(enough) else np.nan
+        needed.append(step * np.ceil(np.round(arms / (1 - drop_out), 6)))
         errors.append(error[enough[0]] if len(enough) else np.nan)
     sources = known[variables.MODEL_SUBJECTS].values
     values = (needed, errors, *deviations.values.T, sources)
@@ -150,16 +162,17 @@ def sample_sizes(
             "power": power,
             "visits": visits,
             "design": design,
+            "drop_out": drop_out,
             "flags": known.attrs["flags"],
             "skipped": known.attrs["skipped"],
         },
     )
 
 
-def _design(visits: int, design: Design) -> pd.DataFrame:
-    """Subject, treatment and visit of each take of two subjects."""
-    both = [(subject, arm) for subject in (0, 1) for arm in (0, 1)]
-    arms = [pair for pair in both if design != PARALLEL or pair[0] == pair[1]]
+def _design(visits: int, design: Design, doses: int) -> pd.DataFrame:
+    """Subject, treatment and visit of each take of the subjects who stand for all."""
+    pairs = itertools.product(range(doses + 1), repeat=2)
+    arms = [pair for pair in pairs if design != PARALLEL or pair[0] == pair[1]]
     return pd.DataFrame(
         [(*pair, float(visit + 1)) for pair in arms for visit in range(visits)],
         columns=[SUBJECT, "treatment", "visit"],
@@ -172,7 +185,8 @@ def _degrees_of_freedom(
     """Degrees of freedom, as in `linear_model`, with each number of subjects."""
     is_between = is_constant_within(x, rows[SUBJECT].to_numpy())
     between = counts - is_between.sum()
-    within = counts * (len(rows) // PEOPLE - 1) - (~is_between).sum()
+    takes = len(rows) // rows[SUBJECT].nunique()
+    within = counts * (takes - 1) - (~is_between).sum()
     free = np.where(is_between[:, None], between, within)
     return np.asarray(free[factors != 0].min(axis=0), float)
 
@@ -200,8 +214,8 @@ def describe_plan(table: Dataset) -> list[str]:
         f"{about['formula']}: subjects in total that show {about['term']} = "
         f"{about['effect']:g} at 5 % with a power of {100 * about['power']:g} %, "
         f"{about['design']}, {about['visits']} visits; empty for more than {MAX_SUBJECTS:,}",
-        "variances come from the visits of the subjects of the database; those who "
-        "leave the study are not counted",
+        "variances come from the visits of the subjects of the database; "
+        f"{about['drop_out']:.0%} of the subjects leave before any visit",
         *about["flags"],
     ]
 
@@ -234,7 +248,16 @@ class Parameters:
     visits: int = option(1, "Visits of each subject.", minimum=1, maximum=MAX_VISITS)
     design: Literal["parallel", "crossover"] = option(
         "parallel",
-        "Half of the subjects are treated, or all are measured with and without.",
+        "Each subject has one dose of the treatment, or all of them.",
+    )
+    doses: int = option(
+        1,
+        "Largest dose: treatment is 0, 1, ... up to it.",
+        minimum=1,
+        maximum=MAX_DOSES,
+    )
+    drop_out: float = option(
+        0.0, "Fraction of the subjects who leave.", minimum=0.0, maximum=0.9
     )
 
 

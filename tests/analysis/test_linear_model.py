@@ -11,14 +11,18 @@ import statsmodels.formula.api as smf
 from planted_tables import planted_tables
 from scipy import stats
 
-from skindb.analysis import linear_model, tidy
-from skindb.analysis.formula_models import _fit
+from skindb.analysis import formula_models, linear_model, tidy
 from skindb.analysis.formulas import MixedModel, design_of, with_levels
 from skindb.errors import InputError
 
 PEOPLE, VISITS = 24, 4
 HC3 = {"cov_type": "HC3", "use_t": True}
 FORMULA = "R_d ~ treatment * visit + age + (1 | subject)"
+
+
+def _fit(model, rows):
+    """Of values without stated errors."""
+    return formula_models._fit(model, rows.assign(error=np.nan))
 
 
 def planted(*, effect=0.0, slope=0.0, seed=5):
@@ -551,3 +555,61 @@ def test_linear_model__repeats_of_a_visit_are_flagged_and_no_baseline_rows():
 def test_linear_model__refuses_margins(margin):
     with pytest.raises(InputError, match="margin: must lie in"):
         linear_model(planted(), formula="R_d ~ age + (1 | subject)", margin=margin)
+
+
+def dosed(slope, error=0.002):
+    """30 subjects without and with 1 and 2 units of lotion."""
+    names = [f"S{i:02d}" for i in range(30)] * 3
+    dose = np.repeat([np.nan, 1.0, 2.0], 30)
+    cohort = planted_tables(
+        names,
+        conditions=["normal"] * 30 + ["lotion"] * 60,
+        albedo=slope * np.nan_to_num(dose),
+        lotion=dose,
+    )
+    takes = [
+        *names[:30],
+        *(
+            f"{s}.lotion.{d}"
+            for s, d in zip(names[30:], np.repeat([1, 2], 30), strict=True)
+        ),
+    ]
+    name = "region_diffuse_reflectance_error"
+    return cohort.assign({name: cohort[name] * (error / 0.002)}).assign_coords(
+        take=takes
+    )
+
+
+def test_linear_model__a_dose_is_an_axis():
+    """The condition normal is the dose 0; intervals of six regions and channels contain
+    the slope.
+    """
+    found = linear_model(dosed(-0.01), formula="R_d ~ lotion + (1 | subject)")
+    assert found.attrs["condition"] == "normal, lotion"
+    assert (found["model_takes"] == 90).all()
+    one = found.sel(term="lotion")
+    # 0.05 of six intervals do not: one may
+    inside = (one["model_estimate_low"] < -0.01) & (one["model_estimate_high"] > -0.01)
+    assert inside.sum() >= 5
+    assert (one["model_p"] < 1e-6).all()
+
+
+@pytest.mark.parametrize("error", [0.0015, 0.0025])
+def test_linear_model__reliability_by_hand(error):
+    """Of a dose within and of a group between subjects, who differ by 0.03."""
+    cohort = dosed(-0.002, error)
+    group = np.array(["a", "b"])[np.arange(90) % 2]
+    found = linear_model(
+        cohort.assign_coords(group=("take", group)),
+        formula="R_d ~ lotion + group + (1 | subject)",
+    ).sel(quantity="R_d face G")
+    values = cohort["region_diffuse_reflectance"].values[:, 0, 1].reshape(3, 30)
+    within = 1 - error**2 / values.var(axis=0, ddof=1).mean()
+    between = 1 - error**2 / 3 / values.mean(axis=0).var(ddof=1)
+    reliability = found["model_reliability"].sel(term=["lotion", "group[T.b]"])
+    np.testing.assert_allclose(reliability, [max(within, 0), between])
+    is_withheld = np.isnan(found["model_p"]).values.tolist()
+    assert is_withheld == [name == "lotion" and within < 0.5 for name in found["term"]]
+    assert (within < 0.5) == (error == 0.0025)
+    flag = "no p values where the reliability is below 0.5"
+    assert (flag in found.attrs["flags"]) == (within < 0.5)

@@ -66,6 +66,30 @@ def test_sample_sizes__of_a_change_over_visits_by_hand(cohort):
     assert float(plan["plan_error"]) == pytest.approx(error[expected])
 
 
+def test_sample_sizes__of_doses_by_hand(cohort):
+    """Doses 0, 1 and 2 have the sum of squares 2 within a subject; of ten subjects one
+    leaves.
+    """
+    formula = "R_d ~ treatment + (1 | subject)"
+    options = {"formula": formula, "term": "treatment", "effect": 0.003, "doses": 2}
+    plan, enlarged = (
+        sample_sizes(cohort, **options, design="crossover", drop_out=part).sel(
+            quantity=NAME
+        )
+        for part in (0.0, 0.1)
+    )
+    count = np.arange(3, 200)
+    error = float(plan["residual_deviation"]) / np.sqrt(2 * count)
+    free = 2 * count - 1
+    power = stats.nct.sf(stats.t.ppf(0.975, free), free, 0.003 / error)
+    expected = count[np.flatnonzero(power >= 0.8)[0]]
+    assert float(plan["plan_subjects"]) == expected
+    assert float(enlarged["plan_subjects"]) == np.ceil(expected / 0.9)
+    assert enlarged["plan_error"].equals(plan["plan_error"])
+    arms = sample_sizes(cohort, **(options | {"effect": 0.02}), drop_out=0.1)
+    assert (arms["plan_subjects"] % 3 == 0).all()
+
+
 def test_sample_sizes__too_small_an_effect_has_no_number(cohort):
     plan = sample_sizes(cohort, formula=FORMULA, term="visit", effect=1e-7, visits=2)
     assert plan["plan_subjects"].isnull().all()
