@@ -37,6 +37,7 @@ from skindb.reflectance.reduction import Systems, factor_reflectance, residuals
 from skindb.reflectance.tables import TableGrid, brdf_metric
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
+from skindb.threads import c_contiguous
 from skindb.types import Array, Float32, Index, dots, finite_rows, unit
 
 if TYPE_CHECKING:
@@ -106,8 +107,8 @@ def population_basis(
     Returns
     -------
     Dataset
-        `population_mixture`, `take_coefficient`. Attributes: relative error over all
-        surfels, and their number.
+        `population_mixture`, `take_coefficient`, `component_vector`. Attributes:
+        relative error over all surfels, and their number.
 
     Raises
     ------
@@ -140,6 +141,7 @@ def population_basis(
         {
             variables.POPULATION_MIXTURE: H,
             variables.TAKE_COEFFICIENT: project(means, H, metric),
+            variables.COMPONENT_VECTOR: component_vectors(H, metric),
         },
         coords={"dictionary": names, "take": takes},
         attrs={
@@ -148,6 +150,15 @@ def population_basis(
             "skipped": skipped_takes(cohort),
         },
     )
+
+
+def component_vectors(mixture: Array, metric: Array) -> Array:
+    """Components (k, m) of a basis as vectors (k, k) whose Euclidean distances are those
+    of the BRDFs, from the metric (m, m) of these.
+    """
+    weights = c_contiguous(np.asarray(mixture, float))
+    values, vectors = np.linalg.eigh(weights @ metric @ weights.T)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _start_weights(cohort: Dataset, takes: Sequence[str], rng: Generator) -> Array:

@@ -55,7 +55,7 @@ from skindb.parameters import (
     permutations_option,
     seed_option,
 )
-from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, stored_brdf
+from skindb.reflectance.tables import TableGrid, brdf_coords, stored_brdf
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
 from skindb.threads import c_contiguous
@@ -157,10 +157,8 @@ def brdf_space(
     takes, named, flags = grouped_takes(cohort, group_by)
     coefficient = _coefficients(takes.take, basis)
     mixture = basis[variables.POPULATION_MIXTURE].values.astype(float)
-    [(metric, brdf)] = each_item(partial(_metric_and_basis, mixture), [tables])
-    # R with R R^T = metric: the length of c R is that of the BRDF with the coefficients c
-    values, vectors = np.linalg.eigh(metric)
-    place = coefficient @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    [brdf] = each_item(partial(_mixed, c_contiguous(mixture)), [tables])
+    place = coefficient @ basis[variables.COMPONENT_VECTOR].values
     subjects = _by_subject(takes, named, coefficient, place)
     centre = known_mean(known_mean(np.moveaxis(subjects.place, 1, 0)))
     length = float(np.linalg.norm(centre)) or 1.0
@@ -286,10 +284,9 @@ def _coefficients(names: Sequence[str], basis: Dataset) -> Array:
     return stored.astype(float)
 
 
-def _metric_and_basis(mixture: Array, tables: AnyArray) -> tuple[Array, Array]:
-    """Gram matrix (k, k) and tables (nh, nd, np, k) of the components."""
-    weights = c_contiguous(mixture)
-    return weights @ brdf_metric(tables) @ weights.T, tables @ weights.T
+def _mixed(mixture: Array, tables: AnyArray) -> AnyArray:
+    """Tables (nh, nd, np, k) of the components."""
+    return tables @ mixture.T
 
 
 def _by_subject(

@@ -53,6 +53,7 @@ SIDES = ("with", "without")
 # subjects with or without a trait, below which individual differences dominate its
 # vector
 FEW = 10
+BRDF_DISTANCE = variables.TRAIT_BRDF_DISTANCE
 LOG_SIGMA_TR = variables.TRAIT_LOG_SIGMA_TR_SHIFT
 RESAMPLES = 200  # of subjects in the bootstrap, which gives standard errors to 5 %
 
@@ -110,7 +111,8 @@ def trait_vectors(
     Returns
     -------
     Dataset
-        `trait_brdf_shift`, `trait_histogram_shift`, `trait_quantile_shift`,
+        `trait_brdf_shift` and the `trait_brdf_distance` that it is,
+        `trait_histogram_shift`, `trait_quantile_shift`,
         `trait_log_sigma_tr_shift`, with `texture` also `trait_texture_shift`, and
         standard errors of all except histograms and texture by bootstrap over subjects
         (NaN if a side has fewer than two); `trait_count` (side: with, without; for
@@ -139,6 +141,12 @@ def trait_vectors(
             flags.append(f"excluded: {error}")
     values = _compared_values(cohort, basis, albedo, texture)
     rng = np.random.default_rng(0) if rng is None else rng
+    shifts = _shifts([*units.values()], values, rng)
+    length = float(np.linalg.norm(known_mean(values[BRDF_DISTANCE]))) or 1.0
+    for name in (BRDF_DISTANCE, f"{BRDF_DISTANCE}_error"):
+        shifts[name] = np.linalg.norm(shifts[name], axis=-1) / length
+    if not units:
+        flags.append("no attribute and no condition differs between the takes")
     counts = np.array([[mask.sum() for mask in split[name]] for name in units])
     counts = counts.reshape(len(units), len(SIDES))
     part = {} if texture is None else {"part": texture["part"].values}
@@ -146,7 +154,7 @@ def trait_vectors(
         {
             variables.TRAIT_COUNT: counts,
             variables.TAKE_LOG_SIGMA_TR: _mean_over_sites(values[LOG_SIGMA_TR]),
-            **_shifts([*units.values()], values, rng),
+            **shifts,
         },
         coords={
             "take": cohort["take"].values.tolist(),
@@ -218,6 +226,7 @@ def _compared_values(
     coefficients = basis[variables.TAKE_COEFFICIENT].sel(take=takes).values
     values = {
         variables.TRAIT_BRDF_SHIFT: coefficients,
+        BRDF_DISTANCE: coefficients @ basis[variables.COMPONENT_VECTOR].values,
         variables.TRAIT_QUANTILE_SHIFT: quantiles(histograms, edges),
         LOG_SIGMA_TR: log_sigma_tr,
     }
@@ -388,8 +397,8 @@ def plot_traits(traits: Dataset, *, ax: Axes | None = None) -> Axes:
 
 
 def tabulate_traits(traits: Dataset) -> Table:
-    """Header and one row per trait: numbers of takes, and RMS lengths of the parts of
-    its vector and of their errors.
+    """Header and one row per trait: numbers of takes, the distance of BRDFs, RMS lengths
+    of the other parts of its vector, and their errors.
     """
     face = traits.sel(region=FACE, drop=True)
     columns = {
@@ -397,7 +406,7 @@ def tabulate_traits(traits: Dataset) -> Table:
         for side in SIDES
     }
     for name, variable in (
-        ("brdf", variables.TRAIT_BRDF_SHIFT),
+        ("brdf", BRDF_DISTANCE),
         ("colour", variables.TRAIT_QUANTILE_SHIFT),
         ("log_sigma_tr", LOG_SIGMA_TR),
     ):

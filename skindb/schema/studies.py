@@ -172,6 +172,10 @@ TAKE_COEFFICIENT = declare(
     "mean surface BRDF of a take in the common basis",
     f"{PAPER}, section 10.1",
 )
+COMPONENT_VECTOR = declare(
+    "float64 population_basis/component_vector(component, component_2) [1]",
+    "components as vectors whose Euclidean distances are those of the BRDFs",
+)
 
 # albedo
 COLOUR_MEAN = declare(
@@ -664,6 +668,14 @@ TRAIT_BRDF_SHIFT = declare(
     "float64 traits/trait_brdf_shift(trait, component) [1]",
     "mean coefficient with the trait minus the mean without",
     f"{PAPER}, section 11",
+)
+TRAIT_BRDF_DISTANCE = declare(
+    "float64 traits/trait_brdf_distance(trait) [1]",
+    "distance of the BRDFs of trait_brdf_shift, over the length of the mean BRDF of the takes",
+)
+TRAIT_BRDF_DISTANCE_ERROR = declare(
+    "float64 traits/trait_brdf_distance_error(trait) [1]",
+    "distance that the scatter of subjects alone would give, by bootstrap",
 )
 TRAIT_QUANTILE_SHIFT = declare(
     "float64 traits/trait_quantile_shift(trait, region, axis, level) [1]",

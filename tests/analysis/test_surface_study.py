@@ -23,6 +23,7 @@ from skindb.analysis import (
     plot_study,
     tabulate_study,
 )
+from skindb.analysis.brdf import component_vectors
 from skindb.analysis.brdf_plots import lobe, sphere_radiance
 from skindb.errors import InputError
 from skindb.optics.angles import half_difference
@@ -53,7 +54,11 @@ def _planted(
         "condition": ("take", conditions or ["normal"] * n),
     }
     basis = dataset(
-        {"population_mixture": H, "take_coefficient": coefficient},
+        {
+            "population_mixture": H,
+            "take_coefficient": coefficient,
+            "component_vector": component_vectors(H, brdf_metric(TABLES)),
+        },
         coords={"take": takes, "dictionary": NAMES},
     )
     return xr.Dataset(coords={"take": takes, **along}), basis

@@ -7,6 +7,7 @@ import pytest
 from planted_tables import planted_tables
 
 from skindb.analysis import trait_vectors
+from skindb.analysis.traits import tabulate_traits
 from skindb.errors import InputError
 from skindb.schema import dataset
 
@@ -23,6 +24,7 @@ def _vectors(cohort, *, coefficient=None, **options):
     basis = dataset(
         {
             "population_mixture": np.eye(2),
+            "component_vector": np.diag([1.0, 2.0]),
             "take_coefficient": np.stack([values, -values], axis=1),
         },
         coords={"take": takes, "dictionary": ["a", "b"]},
@@ -79,6 +81,15 @@ def test_trait_vectors__errors_are_those_of_means():
     women = values[gender == "female"]
     expected = np.sqrt(men.var(ddof=1) / len(men) + women.var(ddof=1) / len(women))
     np.testing.assert_allclose(found["trait_brdf_shift_error"], expected, rtol=0.2)
+    # all BRDFs are multiples of one
+    length = abs(values.mean())
+    np.testing.assert_allclose(
+        found["trait_brdf_distance"], abs(men.mean() - women.mean()) / length
+    )
+    np.testing.assert_allclose(
+        found["trait_brdf_distance_error"],
+        found["trait_brdf_shift_error"][0] / length,
+    )
     assert found["trait_brdf_shift"].values[0] == pytest.approx(
         men.mean() - women.mean()
     )
@@ -152,3 +163,11 @@ def test_trait_vectors__what_is_held_fixed_has_no_vector():
         match="adjust wealth: must be an attribute other than the compared one",
     ):
         _vectors(cohort, adjust=["wealth"])
+
+
+def test_trait_vectors__without_any_trait_say_why():
+    found = _vectors(planted_tables(_people(3)))
+    assert found.attrs["flags"] == [
+        "no attribute and no condition differs between the takes"
+    ]
+    assert tabulate_traits(found)[1] == []
