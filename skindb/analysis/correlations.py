@@ -80,8 +80,9 @@ def component_correlations(
         (pair,) `component_correlation` with its 95 % interval by bootstrap over
         subjects (BCa, Efron 1987; NaN with fewer than ten), `correlation_p` by
         permutation of subjects (statistic: the absolute correlation; exact if the
-        components are independent), `correlation_p_false_discovery` controlled over all
-        pairs, and `correlation_count`, the number of subjects. Attribute "flags".
+        components are independent), `correlation_p_false_discovery` controlled over the
+        pairs of different components, NaN for channels of one, and `correlation_count`,
+        the number of subjects. Attribute "flags".
 
     Raises
     ------
@@ -107,6 +108,10 @@ def component_correlations(
     values_of_pairs, low, high, p, count = (
         np.array(column) for column in zip(*rows, strict=True)
     )
+    kinds = [name.rpartition(" ")[0] for name in COMPONENTS]
+    differ = np.array([kinds[i] != kinds[j] for i, j in pairs])
+    discovered = np.full(len(pairs), np.nan)
+    discovered[differ] = stats.false_discovery_control(p[differ])
     flags = []
     if count.min() < FEW:
         flags.append(f"fewer than {FEW} subjects: there are no intervals")
@@ -116,7 +121,7 @@ def component_correlations(
             variables.COMPONENT_CORRELATION_LOW: low,
             variables.COMPONENT_CORRELATION_HIGH: high,
             variables.CORRELATION_P: p,
-            variables.CORRELATION_P_FALSE_DISCOVERY: stats.false_discovery_control(p),
+            variables.CORRELATION_P_FALSE_DISCOVERY: discovered,
             variables.CORRELATION_COUNT: count,
         },
         coords={"pair": [f"{COMPONENTS[i]} with {COMPONENTS[j]}" for i, j in pairs]},
@@ -195,8 +200,9 @@ def _pearson(x: Array, y: Array, axis: int = -1) -> Array:
 
 def describe_correlations(table: Dataset) -> list[str]:
     """Notes on the table, one line each."""
-    differ = int((table[variables.CORRELATION_P_FALSE_DISCOVERY] < 0.05).sum())
-    line = f"{differ} of {table.sizes['pair']} pairs are correlated (false discovery rate 5 %)"
+    p = table[variables.CORRELATION_P_FALSE_DISCOVERY]
+    counts = f"{int((p < 0.05).sum())} of {int(p.notnull().sum())}"
+    line = f"{counts} pairs of different components are correlated (false discovery rate 5 %)"
     return [line, *table.attrs["flags"]]
 
 

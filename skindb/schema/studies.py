@@ -362,7 +362,7 @@ CORRELATION_P = declare(
 )
 CORRELATION_P_FALSE_DISCOVERY = declare(
     "float64 correlations/correlation_p_false_discovery(pair) [1]",
-    "p value adjusted for all pairs",
+    "p value adjusted for the pairs of different components; NaN for channels of one",
     "Benjamini and Hochberg 1995",
 )
 CORRELATION_COUNT = declare(
