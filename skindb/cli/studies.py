@@ -11,6 +11,7 @@ import ast
 import importlib
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from csv import reader
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -207,8 +208,10 @@ def _run_study(
         writable(csv, ".csv")
     chosen = dict(vars(parameters))
     for several in {"adjust", "quantities"}.intersection(chosen):
-        names = ",".join(chosen[several]).split(",")
-        chosen[several] = tuple(name.strip() for name in names if name.strip())
+        # names may contain commas, in quotes
+        lines = reader(chosen[several], skipinitialspace=True)
+        names = [name.strip() for line in lines for name in line]
+        chosen[several] = tuple(filter(None, names))
     if "dictionary" in chosen:
         chosen["dictionary"] = shared_path(chosen["dictionary"])
     database = existing(click.get_current_context().obj)
