@@ -55,15 +55,24 @@ STORED = (
         "--csv", type=PATH, help="Table to write as comma-separated values (.csv)."
     ),
 )
-# of translucency, which can also draw takes
-FACES = (
-    click.Option(
-        ["--faces"],
-        type=PATH,
-        help="Picture of the least and the most translucent take (.png, .pdf, .svg).",
+# of translucency, which can also draw takes, and of components, which other programs use
+FURTHER = {
+    "translucency": (
+        click.Option(
+            ["--faces"],
+            type=PATH,
+            help="Picture of the least and the most translucent take (.png, .pdf, .svg).",
+        ),
+        click.Option(
+            ["--site"], help="Site of the probe for --faces.  [default: cheek]"
+        ),
     ),
-    click.Option(["--site"], help="Site of the probe for --faces.  [default: cheek]"),
-)
+    "components": (
+        click.Option(
+            ["--out"], type=PATH, help="Face model to write, as AlbedoMM (.h5, .npz)."
+        ),
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -181,8 +190,7 @@ def _study_command(study: Declaration) -> click.Command:
         run = add(run)
     text = f"Study the {study.description}."
     studying = click.command(study.name, help=text, short_help=study.description)(run)
-    if study.name == "translucency":
-        studying.params += FACES
+    studying.params += FURTHER.get(study.name, ())
     options = [option for option in studying.params if option.name != "formula"]
     if len(options) < len(studying.params):
         studying.params = [click.Argument(["formula"]), *options]
@@ -200,8 +208,11 @@ def _run_study(
     plot: Path | None,
     faces: Path | None = None,
     site: str | None = None,
+    out: Path | None = None,
 ) -> None:
     """Compute or read a study, and print, write and draw it."""
+    if out:
+        writable(out, ".h5", ".npz")
     for picture in filter(None, (plot, faces)):
         writable(picture, ".png", ".pdf", ".svg")
     if csv:
@@ -236,6 +247,9 @@ def _run_study(
             )
         if plot:
             skindb.analysis.plot_study(results, plot)
+        if out:
+            model = results["face_model"].to_dataset().load()
+            skindb.analysis.write_face_model(model, out)
     _report(database, study, results, csv)
 
 

@@ -52,7 +52,7 @@ RADIANCE_SHOT_VARIANCE = declare(
 SURFEL_POSITION = declare(
     "float32 surfels/surfel_position(surfel, xyz) [mm]",
     "position in the subject frame, surfels in Morton order",
-    uses=Use.COPIED | Use.SAMPLED | Use.SURVIVES_EDIT,
+    uses=Use.COPIED | Use.SAMPLED | Use.MAPPED | Use.SURVIVES_EDIT,
 )
 SURFEL_NORMAL = declare(
     "float32 surfels/surfel_normal(surfel, xyz) [1]",

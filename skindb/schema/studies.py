@@ -106,6 +106,10 @@ MM_PER_UV = declare(
 )
 
 # maps
+TEXEL_SURFEL_POSITION = declare(
+    "float32 maps/texel_surfel_position(v, u, xyz) [mm]",
+    "position in the subject frame",
+)
 TEXEL_DIFFUSE_REFLECTANCE = declare(
     "float32 maps/texel_diffuse_reflectance(v, u, channel) [1]",
     "diffuse albedo R_d in the common (u, v); NaN outside the measured surface",
@@ -319,26 +323,60 @@ ATTRIBUTE_ASSOCIATION = declare(
     "number of its values",
 )
 
-# components
-PRINCIPAL_MEAN = declare(
-    "float32 components/principal_mean(v, u, channel) [1]",
-    "mean R_d over takes; NaN where a take has none",
+# face_model
+FACE_MEAN = declare(
+    "float32 face_model/face_mean(quantity, v, u) [1]",
+    "mean over subjects of position in mm, ln R_d, surface reflectance and ln sigma_tr; "
+    "NaN where a subject has none",
 )
-PRINCIPAL_AXIS = declare(
-    "float32 components/principal_axis(component, v, u, channel) [1]",
-    "unit vectors along which R_d varies most",
+FACE_MODE = declare(
+    "float32 face_model/face_mode(mode, quantity, v, u) [1]",
+    "change of face_mean with one standard deviation of a mode",
+    "Tipping and Bishop 1999",
 )
-PRINCIPAL_SCORE = declare(
-    "float64 components/principal_score(take, component) [1]",
-    "place of a take along an axis",
+FACE_SLOPE = declare(
+    "float32 face_model/face_slope(term, quantity, v, u) [1]",
+    "change of face_mean per unit of a term of the regression",
 )
-PRINCIPAL_VARIANCE_RATIO = declare(
-    "float64 components/principal_variance_ratio(component) [1]",
-    "fraction of the variance between takes",
+FACE_SCALE = declare(
+    "float64 face_model/face_scale(quantity) [1]",
+    "root of the total variance of the block of a quantity between subjects",
 )
-PRINCIPAL_RESIDUAL = declare(
-    "float64 components/principal_residual(take) [1]",
-    "root mean square of R_d that the components leave",
+TERM_MEAN = declare(
+    "float64 face_model/term_mean(term) [1]", "mean of a term over subjects"
+)
+NOISE_VARIANCE = declare(
+    "float64 face_model/noise_variance() [1]",
+    "mean square that the modes leave in subjects held out, over that of face_scale",
+)
+MODE_VARIANCE_RATIO = declare(
+    "float64 face_model/mode_variance_ratio(mode, block) [1]",
+    "fraction of the variance of a block between subjects",
+)
+MODE_LARGEST_SUBJECT = declare(
+    "float64 face_model/mode_largest_subject(mode) [1]",
+    "largest fraction of the variance of a mode that one subject has",
+)
+MODE_SCORE = declare(
+    "float64 face_model/mode_score(subject, mode) [1]",
+    "place of a subject along a mode, in standard deviations",
+)
+RECONSTRUCTION_ERROR = declare(
+    "float64 face_model/reconstruction_error(mode_count, block) [1]",
+    "RMS error of subjects held out: distance of points in mm for shape, relative for "
+    "albedo and translucency, absolute for gloss",
+)
+FACE_DISTANCE = declare(
+    "float64 face_model/face_distance(subject) [1]",
+    "Mahalanobis distance within the modes of the other subjects",
+)
+FACE_DISTANCE_P = declare(
+    "float64 face_model/face_distance_p(subject) [1]",
+    "probability of a larger distance (Hotelling)",
+)
+FACE_LOG_DENSITY = declare(
+    "float64 face_model/face_log_density(subject) [1]",
+    "log density of the scaled face in the model of the other subjects",
 )
 
 # correlations

@@ -31,7 +31,7 @@ DIMS = set(
     "lobe v u component region xyz uv "
     "corner landmark row col coefficient axis theta_h theta_d phi_d photograph image_row image_col "
     "group k take edge bin trait side level status samples space statistic "
-    "contrast quantity term effect attribute "
+    "contrast quantity term effect attribute mode mode_count block subject "
     "part cell chromophore pair take_2 component_2 placement pressure_sample step "
     "response_level exposure correction".split()
 )

@@ -72,12 +72,19 @@ def test_maps__find_the_step(database):
     assert study.attrs["registration"][0]["reason"].startswith("8 takes")
 
 
-def test_components__first_axis_is_the_step(database):
-    study = workflow.components(database)
-    assert study.attrs["study"] == "components"
-    scores = np.array([row[1] for row in tabulate_study(study)[1]])
+def test_components__first_mode_is_the_step(database, tmp_path):
+    study = workflow.components(database, k=2)
+    assert study.attrs["study"] == "components.k-2"
+    model = study["face_model"].to_dataset()
+    scores = model["mode_score"].sel(mode=1).values
     assert abs(np.corrcoef(scores, np.arange(8) % 2)[0, 1]) > 0.95
-    assert "of the variance between 8 takes" in describe_study(study)[0]
+    assert describe_study(study)[0].startswith("8 subjects, each with the mean")
+    out = str(tmp_path / "faces.npz")
+    options = ["components", "--k", "2", "--out", out]
+    done = CliRunner().invoke(cli, ["analyze", database.url, *options])
+    assert done.exit_code == 0, done.output
+    with np.load(out) as file:
+        assert file["shape/model/pcaVariance"].shape == (2,)
 
 
 def test_correlations__channels_go_together(database):

@@ -235,6 +235,31 @@ def test_withdraw__registrations_of_others_are_made_without_the_subject(tmp_path
     assert stale_versions(db) == []
 
 
+def test_withdraw__a_model_of_faces_is_made_without_the_subject(tmp_path):
+    people = {take: face_take(seed=seed) for seed, take in enumerate("ABCDEF", 1)}
+    rng = np.random.default_rng(0)
+    for take, model in people.items():
+        fitted = model["fitted"].to_dataset()
+        level = rng.uniform(0.5, 1)
+        colour = fitted["diffuse_reflectance"] * np.float32(level)
+        model["fitted"] = fitted.assign(diffuse_reflectance=colour)
+        model.attrs["subject"] = take
+    db, alone = (Database(tmp_path / name) for name in ("db", "alone"))
+    for take, model in people.items():
+        _commit(db, "model", take, model)
+        if take != "A":
+            _commit(alone, "model", take, model)
+    before = workflow.components(db, k=2)
+    assert "A" in before["face_model"]["subject"].values
+    done = workflow.withdraw(db, "A")
+    assert _outcomes(done)["population of components.k-2"] == ""
+    assert _found(db.root, "A") == []
+    after = db.read("population", "components.k-2")["face_model"].to_dataset().load()
+    expected = workflow.components(alone, k=2)["face_model"].to_dataset().load()
+    xr.testing.assert_identical(after, expected)
+    assert after["subject"].values.tolist() == [*"BCDEF"]
+
+
 def test_withdraw__a_study_that_only_named_the_subject_as_skipped(tmp_path):
     db = Database(tmp_path / "db")
     for take, model in population().items():
