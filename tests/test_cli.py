@@ -395,7 +395,7 @@ def test_cli__explain_plans_and_does_not_work(small_database, tmp_path):
         ]
         if "rank" in line
     ]
-    assert "43 of 67 are skipped (rank 16); mixtures" in line
+    assert "43 of 67 are skipped (rank 16, beside 8 exact lobes); mixtures" in line
     assert _run("info", db).stdout == versions
     call = (
         "render",

@@ -205,7 +205,7 @@ class Mixture:
             "dimensions of the dictionary",
             count - space,
             count,
-            f"rank {rank}",
+            f"rank {rank}, beside {self.dictionary.exact} exact lobes",
             rank_truncation(self.dictionary, rank),
             "mixtures, RMS over directions,",
         )
