@@ -47,6 +47,12 @@ def test_analyze__says_how_visits_count(db):
     )
 
 
+def test_analyze__names_with_a_comma_are_in_quotes(db):
+    options = ["--group-by", "gender", "--adjust", '"skin, hand"']
+    result = CliRunner().invoke(cli, ["analyze", db.url, "groups", *options])
+    assert str(result.exception).startswith("adjust skin, hand: must be an attribute")
+
+
 def test_analyze_repeatability__is_a_stored_study(db, tmp_path):
     plot = tmp_path / "icc.png"
     report = json.loads(analyze(db, "repeatability", "--json", "--plot", str(plot)))
