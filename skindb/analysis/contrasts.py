@@ -13,7 +13,7 @@ from numpy.random import Generator
 from scipy.special import gammaln
 from xarray import Dataset
 
-from skindb.analysis.quantities import Quantities
+from skindb.analysis.quantities import NORMAL_95, SURFACE, Quantities
 from skindb.analysis.subjects import (
     CONDITION,
     EVEN,
@@ -309,11 +309,11 @@ def _even_error(cohort: Dataset, quantities: Quantities, rows: Sequence[Mask]) -
     differences of takes in two conditions, given by their masks (take,).
 
     Where both have the same prior, its error cancels, and what was subtracted differs by
-    a fraction of the change of the highlights, which is known to about itself. Errors of
-    different priors are taken as independent.
+    a fraction of the change of the highlights, which is known to about itself; highlights
+    may lack as much. Errors of different priors are taken as independent.
     """
     largest = np.nan_to_num(level_error(cohort))
-    error = 0.0
+    error = change = 0.0
     if largest > 0:
         levels = np.nan_to_num(cohort[LEVEL].values.astype(float))
         first, second = (levels[one].max() for one in rows)
@@ -321,9 +321,11 @@ def _even_error(cohort: Dataset, quantities: Quantities, rows: Sequence[Mask]) -
     if EVEN in cohort.coords:
         values = cohort[EVEN].values.astype(float)
         first, second = (np.nan_to_num(known_mean(values[one])) for one in rows)
-        error = float(np.hypot(error, second - first))
-    error /= max(largest, ROUNDING)
-    return np.asarray(np.multiply(quantities.common, error))
+        change = float(second - first)
+    error = np.hypot(error, change) / max(largest, ROUNDING)
+    is_surface = np.char.startswith(quantities.names, SURFACE)
+    lacking = np.where(is_surface, NORMAL_95 * abs(change), 0.0)
+    return np.asarray(np.hypot(np.multiply(quantities.common, error), lacking))
 
 
 @dataclass(frozen=True)

@@ -241,7 +241,7 @@ def _texel_quantities(takes: Dataset, *, quantity: Quantity, size: int) -> Quant
     if quantity == REFLECTANCE:
         common = NORMAL_95 * float(np.nan_to_num(level_error(takes)))
     subject = tuple(map(str, takes["subject"].values))
-    return Quantities(values, subject, common=(common,))
+    return Quantities(values, subject, (quantity.name,), common=(common,))
 
 
 def _block_means(take: Dataset, quantity: Quantity, size: int) -> Array:

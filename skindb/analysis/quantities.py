@@ -139,7 +139,8 @@ class Quantities:
 
     values: Array  # (n, q) as they are compared; NaN where there is no value
     subject: tuple[str, ...]  # (n,) names of the subjects
-    names: tuple[str, ...] = ()  # (q,) for example "R_d face G"; none of texels
+    # (q,) for example "R_d face G"; of texels one for all
+    names: tuple[str, ...] = ("",)
     is_log: tuple[bool, ...] = ()  # (q,)
     # (q,) half-width of the 95 % interval of an error that all takes have in common
     common: tuple[float, ...] = (0.0,)

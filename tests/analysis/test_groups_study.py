@@ -429,7 +429,10 @@ def _unlike_surfaces(after, change):
     )
     error = np.repeat([0.01, after], 20)
     cohort = cohort.assign_coords(fit_even_reflection_error=("take", error))
-    return _compare(cohort, "condition", quantities=["R_d", "ITA"]).isel(contrast=0)
+    cohort["region_surface_reflectance"][20:] += 0.01
+    return _compare(
+        cohort, "condition", quantities=["R_d", "ITA", "surface reflectance"]
+    ).isel(contrast=0)
 
 
 @pytest.mark.parametrize(
@@ -453,6 +456,10 @@ def test_group_effects__of_conditions_contain_even_reflection(
     # beside the scatter of 20 differences, 0.0013
     assert half == pytest.approx(np.hypot(1.96 * error, 0.0013), rel=0.1)
     assert np.isnan(one["effect_p"]) == is_withheld
+    # 0.01, of which the highlights may have lacked 0.002
+    surface = found.sel(quantity="surface reflectance face")
+    assert surface["effect_high"] - surface["effect_low"] > 2 * 1.96 * 0.002
+    assert surface["effect_p"] < 0.01
     assert np.isnan(found["effect_p"].sel(quantity="ITA face")) == is_withheld
     flags = " ".join(found.attrs["flags"])
     assert ("where even reflection may cause the effect: R_d" in flags) == is_withheld
