@@ -87,6 +87,14 @@ def demo(out: Path, parameters: DemoParameters) -> None:
     default=1,
     help="Number of visits of each subject of the cohort.",
 )
+@click.option(
+    "--paper",
+    is_flag=True,
+    help=(
+        "Datasets A and B of the paper: one subject in seven conditions, and a cohort "
+        "of 87 unless --cohort states another number."
+    ),
+)
 @options_of(SimulationParameters)
 @WORKERS
 def simulate(
@@ -95,6 +103,7 @@ def simulate(
     cohort: int | None,
     conditions: tuple[str, ...],
     visits: int,
+    paper: bool,
     parameters: SimulationParameters,
 ) -> None:
     """Write virtual captures with their true values beside them.
@@ -106,16 +115,18 @@ def simulate(
     progress = bar()
     for option, is_given in (("condition", conditions), ("visits", visits > 1)):
         require(
-            not is_given or cohort is not None,
+            not is_given or cohort or paper,
             f"--{option}",
             "belongs to a cohort",
             "no --cohort",
             "give the number of subjects",
         )
     people = (
-        None
-        if cohort is None
-        else workflow.begin_cohort(out, cohort, conditions, parameters, visits=visits)
+        workflow.begin_cohort(
+            out, cohort, conditions, parameters, visits=visits, paper=paper
+        )
+        if cohort or paper
+        else None
     )
     call = partial(
         workflow.simulate_one, out, parameters, people=people, progress=progress

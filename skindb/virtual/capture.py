@@ -377,7 +377,8 @@ def _write_truth(
     for name in SITE_TRUTH:
         values = [getattr(site, name) for site in skin.sites]
         touched[f"site_{name}"] = np.array(values).reshape(-1, 3)
-    lambertian = [np.mean(abc_parameters()[name][:3]) for name in MATERIALS]
+    abc = abc_parameters()  # lobes are not in it, and reflect nothing evenly
+    lambertian = [np.mean(abc[x][:3]) if x in abc else 0.0 for x in MATERIALS]
     np.savez(
         private_file(out.with_name(out.name + ".truth.npz")),
         vertices=head.vertices,
@@ -386,6 +387,9 @@ def _write_truth(
         diffuse_reflectance=skin.diffuse,
         surface_weights=skin.weights,
         surface_names=np.array(MATERIALS),
+        surface_bases=skin.bases,
+        gloss_causes=np.array([*skin.gloss]),
+        gloss_factors=np.array([*skin.gloss.values()]),
         # includes the Lambertian albedo of the materials, which no fit can distinguish from R_d
         surface_lambertian=skin.weights @ np.array(lambertian),
         sigma_tr=skin.sigma_tr,

@@ -1,6 +1,6 @@
 """Virtual subjects: a frozen record that determines shape, skin and condition."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
@@ -16,6 +16,7 @@ from skindb.virtual.face import FaceShape
 # temperature and exertion of the day
 VISIT_MELANIN = 0.1
 VISIT_BLOOD = 0.4
+PAPER_CONDITIONS = CONDITIONS[:7]  # of dataset A
 ANCESTRIES = ("european", "east_asian", "african", "south_asian")
 
 
@@ -71,6 +72,7 @@ def cohort_people(
     *,
     conditions: Sequence[str] = (),
     visits: int = 1,
+    paper: bool = False,
     seed: int = 2005,
 ) -> list[Person]:
     """A population with the groups and ages of the paper's table 1, dataset B.
@@ -89,6 +91,8 @@ def cohort_people(
         Visits of every subject in every condition. With more than one, melanin and blood
         vary between visits, normally with the standard deviations `VISIT_MELANIN` and
         `VISIT_BLOOD`, about those of the subject.
+    paper
+        Whether dataset A comes first: one more subject, in seven conditions.
     seed
         Random seed for the order, ages, skins and shapes.
     """
@@ -96,6 +100,9 @@ def cohort_people(
     kinds = [(group, i) for group in groups for i in range(group["subjects"])]
     order = np.random.default_rng([seed, 87]).permutation(len(kinds))
     people = []
+    if paper:
+        subject = Person(**_tables()["dataset_a"])
+        people = _takes_of(subject, PAPER_CONDITIONS, visits)
     for number in range(subjects):
         group, i = kinds[order[number % len(kinds)]]
         ancestries = group["ancestries"]
@@ -120,10 +127,17 @@ def cohort_people(
             blood=float(rng.normal(0, 1)),
             fullness=float(rng.uniform(0.3, 0.7)),
         )
-        for condition in dict.fromkeys([person.condition, *conditions]):
-            worn_by = replace(person, condition=condition)
-            people += _at_visits(worn_by, visits) if visits > 1 else [worn_by]
+        people += _takes_of(person, [person.condition, *conditions], visits)
     return people
+
+
+def _takes_of(person: Person, conditions: Iterable[str], visits: int) -> list[Person]:
+    """A person in each of these conditions, at each visit."""
+    takes = []
+    for condition in dict.fromkeys(conditions):
+        worn_by = replace(person, condition=condition)
+        takes += _at_visits(worn_by, visits) if visits > 1 else [worn_by]
+    return takes
 
 
 def _at_visits(person: Person, visits: int) -> list[Person]:
@@ -170,8 +184,8 @@ def face_shape(person: Person) -> FaceShape:
 
 @cache
 def _tables() -> dict[str, Any]:
-    """Subjects of the demo, groups of the paper's table 1 (dataset B), and the terms of a
-    linear model of the shape of faces.
+    """Subjects of the demo, the paper's table 1 (subject of dataset A, groups of dataset
+    B), and the terms of a linear model of the shape of faces.
     """
     tables: dict[str, Any] = package_json("skindb.virtual", "person.json")
     return tables

@@ -18,9 +18,25 @@ from skindb.virtual.head import Head
 from skindb.virtual.person import Person
 
 BLOOD_SPREAD = 0.06  # log green, between people of equal melanin
-# The measured materials with the smallest Lambertian fraction (which a fit cannot
-# distinguish from R_d); two broad lobes, two sharp ones
-MATERIALS = ("special-walnut-224", "black-soft-plastic", "cherry-235", "black-phenolic")
+# BRDFs of the dictionary with wide lobes: narrow ones would be blurred by the curvature of
+# the skin within a pixel. The first BASES are those of a person, of which the first
+# two are mixed with the next two; a film of oil or water and powder add the last two.
+MATERIALS = (
+    "ggx 0.37",
+    "ggx 0.24",
+    "special-walnut-224",
+    "ggx 0.15",
+    "ggx 0.58",
+    "cherry-235",
+    "ggx 0.097",
+    "polyurethane-foam",
+)
+SHARP = [1, 3]  # of BASES
+BASES = (
+    4  # of one person, as in the paper; six in all conditions, eight in a population
+)
+MIDDLE_AGE = 40.0  # years, at which age has no effect on gloss
+MIX_SPREAD = 0.3  # between people, of the fraction of the second material of a pair
 WAVES = 40  # of `smooth_noise`
 PATCH = 6.0  # mm about a probe site over which its colour is averaged
 
@@ -50,11 +66,25 @@ class ConditionEffect:
     """Effect of a condition on the skin."""
 
     gloss: float = 1.0  # factor on the specular albedo
-    sharp: float = 1.0  # factor on the fractions of the two sharper materials
+    sharp: float = 1.0  # factor on the fractions of the SHARP bases
+    film: float = 0.0  # fraction of the specular albedo
+    powder: float = 0.0  # fraction of the specular albedo
     melanin: float = 0.0  # added log green
     blood: float = 0.0  # added log green
     even: float = 0.0  # fraction of the pigment's variation that is covered
     translucency: float = 1.0  # factor on sigma_tr
+
+
+@dataclass(frozen=True)
+class GlossEffects:
+    """Effects of ancestry and age on gloss: the modeller's choice, no claim about anyone."""
+
+    albedo: dict[str, float]  # factor on the specular albedo
+    albedo_per_year: float  # of its logarithm
+    second: dict[
+        str, list[float]
+    ]  # mean fractions of the second materials of the pairs
+    second_per_year: list[float]
 
 
 @dataclass(frozen=True)
@@ -65,8 +95,9 @@ class SkinTables:
     mean: dict[tuple[str, str], Float64]  # ancestry and gender -> R_d (site, channel)
     # ancestry and gender -> relative standard deviation between people, green, cheek
     spread: dict[tuple[str, str], float]
-    # by region, "elsewhere" for the others: albedo at normal incidence, fractions of MATERIALS
+    # by region, "elsewhere" for the others: albedo at normal incidence, fractions of BASES
     gloss: dict[str, list[float]]
+    gloss_effects: GlossEffects
     sigma_tr: dict[str, Float64]  # paper, table 2: site -> mean (channel,) in mm^-1
     effects: dict[str, ConditionEffect]  # by condition
 
@@ -106,6 +137,7 @@ def skin_tables() -> SkinTables:
             region: [row["albedo"], *row["fractions"]]
             for region, row in tables["gloss"].items()
         },
+        GlossEffects(**tables["gloss_effects"]),
         {site: np.array(mean) for site, mean in tables["sigma_tr"].items()},
         {name: ConditionEffect(**row) for name, row in tables["effects"].items()},
     )
@@ -129,6 +161,8 @@ class Skin:
 
     diffuse: Float64  # (n, 3) R_d
     weights: Float64  # (n, k) of MATERIALS
+    bases: Float64  # (BASES, k) fractions of MATERIALS, by albedo
+    gloss: dict[str, float]  # factors on the specular albedo, by what causes them
     sigma_tr: Float64  # (n, 3) mm^-1
     sites: tuple[Site, ...]
 
@@ -153,9 +187,20 @@ def skin_of(
     effect = skin_tables().effects[person.condition]
     diffuse = _diffuse_reflectance(head, person, effect)
     sites = _sites(head, person, diffuse, effect, eta)
+    effects = skin_tables().gloss_effects
+    gloss = {
+        "ancestry": effects.albedo[person.ancestry],
+        "age": float(np.exp(effects.albedo_per_year * (person.age - MIDDLE_AGE))),
+        "condition": effect.gloss,
+    }
+    bases = _bases(person, effect)
+    albedo, fractions = _surface(head, person, effect)
+    albedo = albedo * np.prod([*gloss.values()])
     return Skin(
         diffuse,
-        _weights(head, person, effect, material_albedo),
+        albedo[:, None] * (fractions @ bases) / material_albedo,
+        bases,
+        gloss,
         _sigma_tr(head.vertices, sites),
         sites,
     )
@@ -245,10 +290,29 @@ def _hair(head: Head, person: Person) -> Float64:
     return 1 - keep[:, None] * (1 - np.outer(stubble, [1.0, 0.95, 0.86]))
 
 
-def _weights(
-    head: Head, person: Person, effect: ConditionEffect, material_albedo: Float64
-) -> Float64:
-    """Smooth non-negative weights with the wanted specular albedo at normal incidence."""
+def _bases(person: Person, effect: ConditionEffect) -> Float64:
+    """Fractions (BASES, k) of MATERIALS in each of a person's bases."""
+    effects = skin_tables().gloss_effects
+    second = np.add(
+        effects.second[person.ancestry],
+        np.multiply(effects.second_per_year, person.age - MIDDLE_AGE),
+    )
+    second += MIX_SPREAD * person.stream(7).standard_normal(2)
+    second = np.clip(second, 0, 1)
+    bases = np.eye(BASES, len(MATERIALS))
+    bases[[0, 1], [0, 1]] -= second
+    bases[[0, 1], [BASES, BASES + 1]] = second
+    bases *= 1 - effect.film - effect.powder
+    bases[:, -2:] += effect.film, effect.powder
+    return bases
+
+
+def _surface(
+    head: Head, person: Person, effect: ConditionEffect
+) -> tuple[Float64, Float64]:
+    """Smooth specular albedo (n,) at normal incidence of the person without gloss factors,
+    and fractions (n, BASES) of it.
+    """
     rng = person.stream(4)
     p = head.vertices
     rows = skin_tables().gloss
@@ -258,20 +322,15 @@ def _weights(
     table = np.array([rows[name] for name in names])
     field = member @ table + np.outer(rest, rows["elsewhere"])
     field /= (member.sum(axis=1) + rest)[:, None]
-    personal = rng.lognormal(0, 0.12, 4)
-    share = (
-        field[:, 1:]
-        * np.exp(
-            np.stack([0.15 * smooth_noise(p, 30, rng=rng) for _ in range(4)], axis=1)
-        )
-        * personal
-    )
-    share *= [1.0, 1.0, effect.sharp, effect.sharp]
-    share /= share.sum(axis=1, keepdims=True)
+    personal = rng.lognormal(0, 0.12, BASES)
+    noise = [0.5 * smooth_noise(p, 30, rng=rng) for _ in range(BASES)]
+    fractions = field[:, 1:] * np.exp(np.stack(noise, axis=1)) * personal
+    fractions[:, SHARP] *= effect.sharp
+    fractions /= fractions.sum(axis=1, keepdims=True)
     albedo = (
         field[:, 0] * (1 + 0.05 * smooth_noise(p, 25, rng=rng)) * rng.lognormal(0, 0.06)
     )
-    return np.clip(albedo, 0.03, 0.06)[:, None] * effect.gloss * share / material_albedo
+    return np.clip(albedo, 0.03, 0.06), fractions
 
 
 def _sites(

@@ -17,6 +17,7 @@ from skindb.virtual.capture import simulate_takes
 from skindb.virtual.person import Person, cohort_people
 from skindb.workflow.takes import map_takes, results_of
 
+PAPER_SUBJECTS = 87  # of dataset B
 COHORT = "cohort.json"  # what the captures of a folder were made with
 
 
@@ -27,6 +28,7 @@ def simulate(
     cohort: int | None = None,
     conditions: Sequence[str] = (),
     visits: int = 1,
+    paper: bool = False,
     workers: int | None = None,
     progress: Progress = silent,
     **options: Any,
@@ -47,6 +49,9 @@ def simulate(
         Conditions in which every subject of the cohort is photographed too.
     visits
         Visits of every subject of the cohort, see `skindb.virtual.person.cohort_people`.
+    paper
+        The datasets of the paper: a cohort, of 87 subjects by default, and one more
+        subject in seven conditions.
     workers
         Number of takes at a time, each in its own process; default one, in this process.
     progress
@@ -68,9 +73,11 @@ def simulate(
     """
     parameters = SimulationParameters(**options)
     people = (
-        None
-        if cohort is None
-        else begin_cohort(Path(out), cohort, conditions, parameters, visits=visits)
+        begin_cohort(
+            Path(out), cohort, conditions, parameters, visits=visits, paper=paper
+        )
+        if cohort is not None or paper
+        else None
     )
     call = partial(
         simulate_one, Path(out), parameters, people=people, progress=progress
@@ -87,11 +94,12 @@ def simulate(
 
 def begin_cohort(
     out: Path,
-    subjects: int,
+    subjects: int | None,
     conditions: Sequence[str],
     parameters: SimulationParameters,
     *,
     visits: int = 1,
+    paper: bool = False,
 ) -> list[Person]:
     """The people of a cohort, whose parameters are noted in its folder, or compared
     with those that are noted there.
@@ -100,6 +108,8 @@ def begin_cohort(
     options = asdict(parameters) | {"conditions": list(conditions)}
     if visits > 1:
         options["visits"] = visits
+    if paper:
+        options["paper"] = paper
     note = out / COHORT
     if note.is_file():
         read = read_json(note, [])
@@ -127,7 +137,11 @@ def begin_cohort(
         make_private(out)
         private_file(note).write_text(json.dumps(options, indent=1), encoding="utf-8")
     return cohort_people(
-        subjects, conditions=conditions, visits=visits, seed=parameters.seed
+        subjects or PAPER_SUBJECTS,
+        conditions=conditions,
+        visits=visits,
+        paper=paper,
+        seed=parameters.seed,
     )
 
 

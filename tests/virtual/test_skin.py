@@ -7,7 +7,7 @@ from skindb.optics.diffusion import diffuse_reflectance, reduced_albedo
 from skindb.parameters import CONDITIONS
 from skindb.virtual.face import FaceShape
 from skindb.virtual.head import parametric_head
-from skindb.virtual.person import ANCESTRIES, Person
+from skindb.virtual.person import ANCESTRIES, Person, cohort_people
 from skindb.virtual.skin import (
     MATERIALS,
     skin_of,
@@ -17,7 +17,8 @@ from skindb.virtual.skin import (
 
 # stand-in albedos of the materials at normal incidence
 TABLES = skin_tables()
-ALBEDO = np.array([0.10, 0.05, 0.20, 0.30])
+ALBEDO = np.array([0.10, 0.05, 0.20, 0.30, 0.08, 0.06, 0.15, 0.25])
+SHARP = [1, 3, 5, 6]
 PERSON = Person("A", 35, "female", "european", 7)
 
 
@@ -64,7 +65,8 @@ def test_skin_of__is_within_physical_limits(head):
 
 
 def test_skin_of__normal_condition_has_the_specular_albedo_of_skin(head):
-    albedo = _specular(_skin(head, PERSON))
+    skin = _skin(head, PERSON)
+    albedo = _specular(skin) / skin.gloss["age"]
     assert albedo.min() >= 0.03 - 1e-12
     assert albedo.max() <= 0.06 + 1e-12
     nose, neck = (albedo[head.membership[r] > 0.9].mean() for r in ("nose", "neck"))
@@ -79,11 +81,35 @@ def test_skin_of__lotion_is_glossier_and_narrower_powder_the_opposite(head):
     assert (_specular(lotion) > 1.2 * _specular(normal)).all()
     assert (_specular(powder) < 0.9 * _specular(normal)).all()
     sharp = [
-        (s.weights[:, 2:] @ ALBEDO[2:]).sum() / _specular(s).sum()
+        (s.weights[:, SHARP] @ ALBEDO[SHARP]).sum() / _specular(s).sum()
         for s in (powder, normal, lotion)
     ]
     assert sharp == sorted(sharp)
     np.testing.assert_array_equal(lotion.diffuse, normal.diffuse)
+
+
+def test_skin_of__one_person_has_four_bases_all_conditions_six_a_population_eight(head):
+    people = cohort_people(20, paper=True)
+    weights = [_skin(head, person).weights[::50] for person in people]
+    assert np.linalg.matrix_rank(weights[0]) == np.linalg.matrix_rank(weights[-1]) == 4
+    of_one = [w for w, p in zip(weights, people, strict=True) if p.subject == "A001"]
+    assert np.linalg.matrix_rank(np.vstack(of_one)) == 6
+    assert np.linalg.matrix_rank(np.vstack(weights)) == 8
+
+
+def test_skin_of__gloss_has_the_stated_factors(head):
+    base = _skin(head, replace(PERSON, age=40))
+    changed = replace(PERSON, age=65, ancestry="african", condition="lotion")
+    skin = _skin(head, changed)
+    effects = TABLES.gloss_effects
+    assert skin.gloss == {
+        "ancestry": effects.albedo["african"],
+        "age": pytest.approx(np.exp(25 * effects.albedo_per_year)),
+        "condition": TABLES.effects["lotion"].gloss,
+    }
+    assert [*base.gloss.values()] == [1, 1, 1]
+    factor = np.prod([*skin.gloss.values()])
+    np.testing.assert_allclose(_specular(skin), factor * _specular(base))
 
 
 def test_skin_of__tan_is_darker_and_hot_is_redder(head):

@@ -45,6 +45,23 @@ def test_cohort_people__the_first_are_the_same_whatever_the_number():
     assert [one for one in twice if one.condition == "normal"] == cohort_people(6)
 
 
+def test_cohort_people__of_the_paper_begin_with_one_subject_in_seven_conditions():
+    people = cohort_people(3, paper=True)
+    assert people[7:] == cohort_people(3)
+    assert {(one.subject, one.age, one.gender) for one in people[:7]} == {
+        ("A001", 31, "male")
+    }
+    assert {one.condition for one in people[:7]} == {
+        "normal",
+        "cold",
+        "hot",
+        "sweat",
+        "lotion",
+        "makeup",
+        "powder",
+    }
+
+
 def test_cohort_people__visits_vary_as_stated():
     """Standard deviations from 2 x 800 degrees of freedom are known to 2 %; 5 standard
     errors are allowed.
