@@ -269,6 +269,7 @@ def _report(
             ("skipped", "skipped"),
             ("out of date", "outdated"),
             ("registration", "registration"),
+            ("spacing", "spacing"),
         )
         for line in skindb.schema.note_lines(attrs.get(name, []))
     ]

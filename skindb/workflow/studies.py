@@ -13,6 +13,7 @@ from functools import partial, wraps
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from dask.delayed import Delayed, delayed
 from xarray import Dataset, DataTree
@@ -31,6 +32,7 @@ from skindb.analysis.subjects import (
 from skindb.errors import InputError, input_error, require
 from skindb.files import Attributes
 from skindb.format.dome import EXPOSURE_RATIO
+from skindb.ingest.surfels import lattice_spacing
 from skindb.parameters import option_of, require_limits
 from skindb.reflectance.brdf_files import read_dictionary
 from skindb.reflectance.dictionary import convolve_disc, embedded_dictionary
@@ -52,6 +54,10 @@ from skindb.workflow.cohorts import (
 )
 from skindb.workflow.derive import Derivation
 
+# Coarsest over finest spacing of surfels of takes that are studied without a note. Scans of
+# one scanner differ by a few per cent, levels of subdivision by a factor of two.
+MAX_SPACING_RATIO = 1.3
+SPACING = (variables.REGION_AREA, variables.REGION_SURFELS)
 STUDY_NAME = r"[A-Za-z0-9_-]{1,64}"
 
 
@@ -159,6 +165,26 @@ def _require_models(db: Database, takes: Sequence[str], release: str | None) -> 
     models = db.takes("model", release=release)
     require_fitted(db, models)
     summarise(db, [take for take in takes or models if take in models], release=release)
+
+
+def spacing_notes(tables: Dataset) -> list[Note]:
+    """A note if the spacings of the surfels differ between the takes of a cohort."""
+    area, count = (tables[name].sum("region").values for name in SPACING)
+    # NaN for takes without fitted surfels
+    spacing = [
+        lattice_spacing(a / n) if n else np.nan
+        for a, n in zip(area, count, strict=True)
+    ]
+    if np.isnan(spacing).all():
+        return []
+    finest, coarsest = np.nanargmin(spacing), np.nanargmax(spacing)
+    if spacing[coarsest] <= MAX_SPACING_RATIO * spacing[finest]:
+        return []
+    low, high = (f"{spacing[i]:.2g} mm" for i in (finest, coarsest))
+    takes = tables["take"].values
+    named = f"{low} apart in {takes[finest]} and {high} in {takes[coarsest]}"
+    cure = f"ingest the takes again with --spacing {spacing[finest]:.2g}"
+    return [note("", f"surfels are {named}: {cure}")]
 
 
 def _require_one_scale(db: Database, study: Study, inputs: Sequence[Record]) -> None:
@@ -360,6 +386,11 @@ def study(
             version = DataTree.from_dict(record.compute(population, chosen))
             if population.notes:
                 version.attrs["registration"] = population.notes
+            studied = population.cohort["take"].values.tolist()
+            tables = db.cohort(
+                "tables", takes=studied, release=release, variables=SPACING
+            )
+            version.attrs["spacing"] = spacing_notes(tables)
             derivation.commit(version)
     return db.read(STUDY, key)
 
