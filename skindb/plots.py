@@ -24,6 +24,7 @@ BLUE, ORANGE, GREEN, RED, PURPLE, SKY, YELLOW = (
     "#56b4e9",
     "#f0e442",
 )
+MARKERS = "osD^vP"  # as many as colours
 CYCLE = (BLUE, ORANGE, GREEN, RED, PURPLE, SKY)
 CHANNELS = (RED, GREEN, BLUE)  # of the camera
 

@@ -4,10 +4,10 @@ basis BRDFs that skin needs (Weyrich et al. 2005, sections 7 and 10.1, figure 15
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from dask.delayed import Delayed
@@ -67,10 +67,12 @@ TABLE_HEADER = (
     "high [%]",
     "reduced by next k [%]",
 )
-STUDY_SURFELS = 200  # of each take, that the study draws
 # surfels of all takes together from which the bases are computed: 56 MB of normal
 # equations
 MAX_FACTORED = 2000
+STUDY_SURFELS = (
+    200  # of each take that the study draws; up to MAX_FACTORED of few takes
+)
 
 
 def population_basis(
@@ -275,9 +277,7 @@ def basis_size_curve(
     """
     require_comparable(cohort, "surfels")
     same_dictionary(cohort)
-    few = max(
-        1, MAX_FACTORED // cohort.sizes["take"]
-    )  # the order of a sample is random: its first surfels are a random sample as well
+    few = max(1, MAX_FACTORED // cohort.sizes["take"])
     once = shared_once(tables)
     factored = Systems.joined(each_take(_systems, cohort, NEEDED, once, slice(few)))
     ks = [k for k in ks if k <= min(factored.rhs.shape)]
@@ -390,6 +390,17 @@ def tabulate_basis_size(curve: Dataset) -> Table:
     return list(TABLE_HEADER), [[k, *row] for k, row in zip(sizes, rows, strict=True)]
 
 
+def size_range(curve: Dataset) -> str:
+    """Numbers of bases that may suffice: "4", "4 to 6" or "at least 4"."""
+    fewest, last = (
+        int(curve[name])
+        for name in (variables.SMALLEST_SIZE, variables.SUFFICIENT_SIZE)
+    )
+    if not last:
+        return f"at least {fewest}"
+    return str(last) if fewest == last else f"{fewest} to {last}"
+
+
 def describe_basis_size(curve: Dataset) -> str:
     """Number of bases that are needed by `choose_size`, and the reason, in one or two sentences."""
     ks = curve["k"].values.tolist()
@@ -403,21 +414,17 @@ def describe_basis_size(curve: Dataset) -> str:
         if excess > tolerance:
             above = f"{100 * excess:.3g} % above that with the whole dictionary"
             reason = f"with {largest}, the error is still {above}"
-        return (
-            f"At least {fewest} bases: {reason}. Try larger sizes or draw more surfels."
-        )
-    sizes = str(sufficient)
+        return f"A{size_range(curve)[1:]} bases: {reason}. Try larger sizes or draw more surfels."
     others = "smaller sizes are significantly worse" if sufficient > ks[0] else ""
     if fewest < sufficient:
-        sizes = f"{fewest} to {sufficient}"
         others = "this sample does not show whether fewer would suffice"
     reasons = [
         f"With {sufficient} the error is significantly within {100 * tolerance:.3g} % of that "
         f"with {largest}, and no further basis reduces it by more than {100 * STEP:.3g} %",
         others,
     ]
-    noun = "basis" if sizes == "1" else "bases"
-    return f"{sizes} {noun}. {'; '.join(filter(None, reasons))}."
+    noun = "basis" if sufficient == 1 else "bases"
+    return f"{size_range(curve)} {noun}. {'; '.join(filter(None, reasons))}."
 
 
 def _take_errors(take: Dataset, tables: Array, bases: Sequence[Array]) -> Array:
@@ -473,33 +480,33 @@ def _surface_rows(
     return rows, offsets, values[surfel, index[:, 0], index[:, 1]] - diffuse
 
 
-def plot_basis_size(curve: Dataset, *, ax: Axes | None = None) -> Axes:
-    """Plot the error against k with its interval; the chosen size is marked."""
+def plot_basis_size(curves: Mapping[str, Dataset], *, ax: Axes | None = None) -> Axes:
+    """Plot errors against k with 95 % intervals, and mark the sizes that may suffice
+    (Weyrich et al. 2005, figure 15).
+
+    Parameters
+    ----------
+    curves
+        Name of a sample -> curve from `basis_size_curve`.
+    ax
+        Axes to draw on; by default new ones.
+    """
     ax = ax or plots.new_axes(6, 3.6)
-    k = curve["k"].values
-    ax.fill_between(
-        k,
-        curve[variables.RELATIVE_ERROR_LOW],
-        curve[variables.RELATIVE_ERROR_HIGH],
-        alpha=0.25,
-        label="95 % interval",
-    )
-    ax.plot(k, curve[variables.RELATIVE_ERROR], "o-", label="error")
-    fewest = int(curve[variables.SMALLEST_SIZE])
-    sufficient = int(curve[variables.SUFFICIENT_SIZE])
-    if sufficient:
-        chosen = (
-            str(sufficient) if fewest == sufficient else f"{fewest} to {sufficient}"
+    for (name, curve), colour, marker in zip(
+        curves.items(), plots.CYCLE, plots.MARKERS, strict=False
+    ):
+        k = curve["k"].values
+        error, low, high = (
+            curve[f"{variables.RELATIVE_ERROR}{end}"] for end in ("", "_low", "_high")
         )
-        ax.axvspan(
-            fewest - 0.05,
-            sufficient + 0.05,
-            color="0.4",
-            alpha=0.4,
-            lw=0,
-            label=f"chosen size: {chosen}",
-        )
-    ax.set_xlabel("number of basis BRDFs k")
+        ax.fill_between(k, low, high, color=colour, alpha=0.25, linewidth=0)
+        label = f"{name} (n = {curve.attrs['surfels']:,} surfels): {size_range(curve)}"
+        style: dict[str, Any] = {"color": colour, "marker": marker, "markersize": 5}
+        ax.plot(k, error, label=label, mfc="white", **style)
+        last = int(curve[variables.SUFFICIENT_SIZE]) or k[-1]
+        chosen = (k >= int(curve[variables.SMALLEST_SIZE])) & (k <= last)
+        ax.plot(k[chosen], error[chosen], linestyle="none", **style)
+    ax.set_xlabel("number of basis BRDFs k (filled: sizes that may suffice)")
     ax.set_ylabel("error of reflectance / error with whole dictionary")
     ax.legend(fontsize=8)
     return ax
@@ -515,8 +522,11 @@ class Parameters:
 
 def compute(population: Population, parameters: Parameters) -> Results:
     """The results of the study."""
+    cohort = population.cohort
+    # the order of a sample is random: its first surfels are a random sample as well
+    drawn = max(STUDY_SURFELS, MAX_FACTORED // cohort.sizes["take"])
     curve = basis_size_curve(
-        population.cohort,
+        cohort.isel(surfel=slice(drawn)),
         tables=population.brdf_tables(),
         rng=np.random.default_rng(parameters.seed),
     )
@@ -531,11 +541,11 @@ STUDY = Study(
     compute=compute,
     shown=("basis_size",),
     tabulate=tabulate_basis_size,
-    plot=plot_basis_size,
+    plot=lambda curve: plot_basis_size({"these takes": curve}),
     describe=lambda curve: [describe_basis_size(curve)],
     # the labels of the weights name the BRDFs of the fits
     cohort_options={
-        "surfels": STUDY_SURFELS,
+        "surfels": MAX_FACTORED,
         "variables": (*BASIS_SIZE_VARIABLES, variables.DICTIONARY_WEIGHT),
     },
 )

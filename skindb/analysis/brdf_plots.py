@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.projections.polar import PolarAxes
 
 VIEW = np.array([0.0, 0.0, 1.0])  # direction to the camera
-MARKERS = "osD^vP"
 LINES = ("-", "--")
 # angles of the lights from the viewing direction, upwards and to the right
 FRONTAL = np.radians(15.0)
@@ -51,7 +50,7 @@ def plot_brdf_space(space: Dataset, *, ax: Axes | None = None) -> Axes:
         takes = "" if len(points) == count else f", {len(points)} takes"
         ax.plot(
             *points.T,
-            MARKERS[i % 6],
+            plots.MARKERS[i % len(plots.MARKERS)],
             color=_colour(i),
             markersize=4,
             alpha=0.75,

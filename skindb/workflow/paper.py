@@ -12,9 +12,9 @@ import pandas as pd
 from xarray import Dataset, DataTree
 
 from skindb import plots
-from skindb.analysis.brdf import describe_basis_size
+from skindb.analysis.brdf import describe_basis_size, plot_basis_size
 from skindb.analysis.brdf_plots import plot_group_spheres
-from skindb.analysis.studies import plot_study, write_plot
+from skindb.analysis.studies import write_plot
 from skindb.errors import InputError, require
 from skindb.files import make_private, private_file
 from skindb.render.figures import write_grid
@@ -22,7 +22,7 @@ from skindb.render.photographs import Comparison, compare_photographs
 from skindb.schema import variables
 from skindb.schema.label import CHANNELS
 from skindb.store import Database
-from skindb.types import Progress, silent, unit
+from skindb.types import Array, Progress, silent, unit
 from skindb.workflow.audit import logged_action
 from skindb.workflow.cohorts import require_fitted
 from skindb.workflow.edits import basis_grid, edit_grid
@@ -37,7 +37,9 @@ MAX_FACES = 5  # of figure 11
 PARTS = ("upper", "lower")  # of the face, in figure 5
 MAX_ROWS = 4  # of figure 19
 TRAITS = ("beard_density", "european", "tan", "lotion")  # of figure 19
-PEOPLE = ["condition", "ancestry", "gender"]  # rows of table 1
+GROUPS = ["ancestry", "gender"]  # of figure 16
+HISTOGRAM_SURFELS = 2000  # of each take, in figure 16
+PEOPLE = ["condition", *GROUPS]  # rows of table 1
 # table 2: mean and variance of red, green and blue [mm^-1, mm^-2]
 SIGMA_TR = {
     "cheek": ((0.5572, 0.1727), (0.9751, 0.2089), (1.5494, 0.1881)),
@@ -178,7 +180,7 @@ def _sigma_tr(source: Source, _: Path) -> list[str]:
     table = source.study("translucency")["translucency_table"].to_dataset()
     names = ["sigma_tr_count", "sigma_tr_mean", variables.SIGMA_TR_VARIANCE]
     rows = table[names].isel(group=0, drop=True).to_dataframe().reset_index()
-    rows.columns = ["site", "channel", "n", "mean [mm^-1]", "variance [mm^-2]"]
+    rows.columns = ["site", "channel", "n", "mean [mm⁻¹]", "variance [mm⁻²]"]
     known = {
         (site, channel): values
         for site, channels in SIGMA_TR.items()
@@ -209,7 +211,7 @@ def _lumitexels(source: Source, picture: Path) -> list[str]:
         camera = _draw_lumitexel(
             ax, samples.isel(surfel=at).load(), surfels.isel(surfel=at).load(), dome
         )
-        ax.set_title(f"a surfel of the {part} half, camera {camera}", fontsize=8)
+        ax.set_title(f"a surfel of the {part} half, {camera}", fontsize=8)
     write_plot(axes[0], picture)
     seen = counts[counts > 0]
     return [
@@ -220,7 +222,7 @@ def _lumitexels(source: Source, picture: Path) -> list[str]:
 
 def _draw_lumitexel(ax: Axes, samples: Dataset, surfel: Dataset, dome: Dataset) -> str:
     """Draw the samples of one surfel in the camera that has most of them over the
-    hemisphere of light directions, and return the name of the camera.
+    hemisphere of light directions, and return its name with their number.
     """
     values = samples[variables.REFLECTANCE_SAMPLE].mean("channel").values
     camera = int(np.argmax(np.isfinite(values).sum(axis=0)))
@@ -239,9 +241,9 @@ def _draw_lumitexel(ax: Axes, samples: Dataset, surfel: Dataset, dome: Dataset) 
     turn = np.linspace(0, 2 * np.pi, 100)
     ax.plot(np.cos(turn), np.sin(turn), color="0.7", linewidth=0.8)
     ax.set(xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), xticks=[], yticks=[], aspect="equal")
-    ax.figure.colorbar(shown, ax=ax, shrink=0.7, label="sample [sr^-1]")
+    ax.figure.colorbar(shown, ax=ax, shrink=0.7, label="sample [sr⁻¹]")
     ax.legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.5, 0), ncols=2)
-    return str(dome["camera"].values[camera])
+    return f"camera {dome['camera'].values[camera]} (n = {is_known.sum()})"
 
 
 def _normals(source: Source, picture: Path) -> list[str]:
@@ -283,7 +285,7 @@ def _profiles(source: Source, picture: Path) -> list[str]:
         ax.set_title(site, fontsize=8)
         ax.set_xlabel("distance [mm]")
     axes[0, 0].yaxis.set_major_formatter("{x:.0e}")
-    axes[0, 0].set_ylabel("reflectance [mm^-2]")
+    axes[0, 0].set_ylabel("reflectance [mm⁻²]")
     axes[0, 0].legend(fontsize=7)
     write_plot(axes[0, 0], picture)
     return [
@@ -338,49 +340,81 @@ def _components(source: Source, picture: Path) -> list[str]:
 
 
 def _spheres(source: Source, picture: Path) -> list[str]:
-    space = source.study("surface", group_by="condition")
+    own = _of_subject(source)
+    takes = own if len(own) > 1 else []
+    space = source.study("surface", group_by="condition", takes=takes)
     write_plot(plot_group_spheres(space["brdf_space"].to_dataset().load()), picture)
-    return ["Mean surface BRDFs over subjects; those of the paper are of one."]
+    return [
+        f"Mean surface BRDFs of {'one subject, as' if takes else 'all subjects; those'} "
+        "in the paper."
+    ]
 
 
 def _basis_sizes(source: Source, picture: Path) -> list[str]:
     own = _of_subject(source)
-    several = f"{len(own)} takes of one subject"
-    groups = {"one take": [source.take], several: own, f"all {len(source.table)}": []}
-    if len(own) < 2:
-        del groups[several]
-    ax = plots.new_axes(6, 3.6)
-    lines = []
-    for (name, takes), colour in zip(groups.items(), plots.CYCLE, strict=False):
-        curve = source.study("brdf", takes=takes)["basis_size"].to_dataset().load()
-        error = curve[variables.RELATIVE_ERROR]
-        ax.plot(
-            curve["k"], error, "o-", color=colour, markersize=3, label=name, alpha=0.7
-        )
-        low, high = (
-            curve[f"{variables.RELATIVE_ERROR}_{end}"] for end in ("low", "high")
-        )
-        ax.fill_between(curve["k"], low, high, color=colour, alpha=0.2, linewidth=0)
-        lines.append(f"- {name}: {describe_basis_size(curve)}")
-    ax.set(
-        xlabel="number of basis BRDFs k",
-        ylabel="error of reflectance / error with whole dictionary",
-    )
-    ax.legend(fontsize=7)
-    write_plot(ax, picture)
+    groups = {"one take": [source.take]}
+    others = source.table.index.difference(own).tolist()
+    if len(own) > 1:
+        groups[f"{len(own)} takes of one subject"] = own
+    if others:
+        groups[f"{len(others)} takes of others"] = others
+    curves = {
+        name: source.study("brdf", takes=takes)["basis_size"].to_dataset().load()
+        for name, takes in groups.items()
+    }
+    write_plot(plot_basis_size(curves), picture)
+    lines = [f"- {name}: {describe_basis_size(curves[name])}" for name in curves]
     return ["\n".join(lines)]
 
 
 def _histograms(source: Source, picture: Path) -> list[str]:
-    results = source.study("albedo", group_by="ancestry")
-    plot_study(results, picture)
-    return ["Histograms of the first axis of decorrelated colours, by ancestry."]
+    from matplotlib import pyplot
+
+    names = [variables.DIFFUSE_REFLECTANCE, variables.SURFEL_AREA]
+    cohort = source.db.cohort("surfels", surfels=HISTOGRAM_SURFELS, variables=names)
+    cohort = cohort.isel(take=cohort["condition"].values == "normal").load()
+    words = {name: cohort[name].values for name in GROUPS if name in cohort.coords}
+    require(words, "takes", f"must have {' or '.join(GROUPS)}", "neither")
+    group = pd.DataFrame(words).astype(str).agg(", ".join, axis=1).to_numpy()
+    groups = sorted(set(group))
+    columns = min(len(groups), 4)
+    rows = -(-len(groups) // columns)
+    figure, axes = pyplot.subplots(
+        rows, columns, figsize=(2.3 * columns, 2 * rows), squeeze=False, sharey=True
+    )
+    edges = np.linspace(0, np.nanquantile(cohort[names[0]], 0.999), 41)
+    for ax, name in zip(axes.flat, groups, strict=False):
+        members = cohort.isel(take=group == name)
+        takes = [members.isel(take=i) for i in range(members.sizes["take"])]
+        for c, colour in enumerate(plots.CHANNELS):
+            means = [_histogram(take.isel(channel=c), edges) for take in takes]
+            ax.stairs(np.mean(means, axis=0), edges, color=colour, label=CHANNELS[c])
+        ax.set_title(f"{name} (n = {len(takes)})", fontsize=8)
+    for ax in axes.flat[len(groups) :]:
+        ax.set_axis_off()
+    axes[0, 0].set_ylabel("fraction of the area")
+    axes[-1, 0].set_xlabel("albedo $R_d$", parse_math=True)
+    axes[0, 0].legend(fontsize=7)
+    figure.tight_layout()
+    write_plot(figure, picture)
+    return ["Mean histograms over takes in the condition normal."]
+
+
+def _histogram(take: Dataset, edges: Array) -> Array:
+    """Fractions of the area of a take with R_d between these edges, in one channel."""
+    colour, area = (
+        take[name].values.astype(float)
+        for name in (variables.DIFFUSE_REFLECTANCE, variables.SURFEL_AREA)
+    )
+    is_known = np.isfinite(colour)
+    counts, _ = np.histogram(colour[is_known], edges, weights=area[is_known])
+    return np.asarray(counts / area[is_known].sum())
 
 
 def _translucent(source: Source, picture: Path) -> list[str]:
     shown = translucency_grid(source.db, picture, progress=source.progress)
     words = [f"{take} {length:.2f} mm" for take, length in shown.items()]
-    return [f"Mean of 1 / sigma_tr over the channels, cheek: {', '.join(words)}."]
+    return [f"Mean of 1 / σₜᵣ over the channels, cheek: {', '.join(words)}."]
 
 
 def _edits(source: Source, picture: Path) -> list[str]:
@@ -463,7 +497,7 @@ ITEMS = (
     Item(
         "Figures 17 and 18: least and most translucent",
         _translucent,
-        "sigma_tr of (0.9171, 1.5682, 1.6569) and (0.3558, 0.7932, 1.5173) mm^-1.",
+        "σₜᵣ of (0.9171, 1.5682, 1.6569) and (0.3558, 0.7932, 1.5173) mm⁻¹.",
     ),
     Item("Figure 19: edits", _edits, "beard, Caucasian, tan and lotion."),
 )

@@ -196,7 +196,7 @@ def test_basis_size_curve__finds_the_planted_size():
     assert float(curve["relative_error"].sel(k=1)) > 1.1
     assert (curve["relative_error_low"] <= curve["relative_error"] + 1e-9).all()
     assert curve.attrs["surfels"] == 80
-    assert plot_basis_size(curve).get_xlabel()
+    assert plot_basis_size({"planted": curve}).get_xlabel()
 
 
 def _benchmark():
