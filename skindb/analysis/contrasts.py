@@ -5,7 +5,9 @@ and of maps have in common. The unit of inference is the subject.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,12 @@ from numpy.random import Generator
 from scipy.special import gammaln
 from xarray import Dataset
 
-from skindb.analysis.quantities import NORMAL_95, SURFACE, Quantities
+from skindb.analysis.quantities import (
+    NORMAL_95,
+    SURFACE,
+    Quantities,
+    quantities_of,
+)
 from skindb.analysis.subjects import (
     CONDITION,
     EVEN,
@@ -32,7 +39,7 @@ from skindb.analysis.subjects import (
     trait_of,
     word_of,
 )
-from skindb.errors import Fault, require
+from skindb.errors import Fault, InputError, require
 from skindb.numerics.inference import (
     Effects,
     effects,
@@ -42,6 +49,7 @@ from skindb.numerics.inference import (
 )
 from skindb.numerics.statistics import ROUNDING, known_mean
 from skindb.parameters import ContrastParameters
+from skindb.schema.label import FACE
 from skindb.types import Array, Mask, finite_rows
 
 # below which a quantity shows errors more than subjects or their changes ("poor" in Koo
@@ -140,6 +148,26 @@ def contrasts(
         Contrast(name, quantities, regressor, covariates, is_number).complete()
         for name, regressor in regressors.items()
     ]
+
+
+def unreliable_surfaces(cohort: Dataset, group_by: str) -> list[str]:
+    """Warnings about comparisons of surface BRDFs, whose errors are not known: the surface
+    reflectance of the face has a low reliability.
+    """
+    flags = []
+    measure = partial(quantities_of, names=(SURFACE,))
+    with suppress(InputError):  # of what the tables of the cohort cannot compare
+        for contrast in contrasts(cohort, group_by, (), measure):
+            known = dict(
+                zip(contrast.quantities.names, contrast.reliability, strict=True)
+            )
+            value = known.get(f"{SURFACE} {FACE}", np.nan)
+            if value < MIN_RELIABILITY:
+                flags.append(
+                    f"{contrast.name}: errors explain the differences of BRDFs: the "
+                    f"reliability of the {SURFACE} of the {FACE} is {value:.2f}"
+                )
+    return flags
 
 
 def _covariates(

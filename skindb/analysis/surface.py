@@ -18,6 +18,7 @@ from xarray import Dataset
 
 from skindb.analysis.brdf import population_basis
 from skindb.analysis.brdf_plots import plot_space
+from skindb.analysis.contrasts import unreliable_surfaces
 from skindb.analysis.quantities import Quantities
 from skindb.analysis.study import (
     Population,
@@ -207,7 +208,9 @@ def brdf_space(
             "group_by": group_by,
             "groups_of_takes": named,
             "adjusted_by": method,
-            "flags": flags + [flag for pair in pairs for flag in pair.flags],
+            "flags": flags
+            + [flag for pair in pairs for flag in pair.flags]
+            + unreliable_surfaces(cohort, group_by),
             "skipped": skipped_takes(cohort),
         },
     )

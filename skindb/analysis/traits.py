@@ -17,6 +17,7 @@ from xarray import Dataset
 from skindb import plots
 from skindb.analysis.albedo import albedo_and_texture, quantiles
 from skindb.analysis.brdf import population_basis
+from skindb.analysis.contrasts import unreliable_surfaces
 from skindb.analysis.quantities import trusted
 from skindb.analysis.study import (
     Population,
@@ -27,6 +28,7 @@ from skindb.analysis.study import (
     table_of,
 )
 from skindb.analysis.subjects import (
+    CONDITION,
     Subjects,
     known_traits,
     numeric_attributes,
@@ -165,7 +167,9 @@ def trait_vectors(
             **part,
         },
         attrs={
-            "flags": flags + _flags(list(units), counts),
+            "flags": flags
+            + _flags(list(units), counts)
+            + unreliable_surfaces(cohort, CONDITION),
             "adjust": list(adjust),
             "skipped": skipped_takes(cohort),
         },

@@ -114,6 +114,23 @@ def test_brdf_space__distances_are_those_of_the_tables():
     np.testing.assert_array_equal(found[..., -1], found[..., 0])
 
 
+@pytest.mark.parametrize("error", [0.0001, 0.002])
+def test_brdf_space__changes_within_the_errors_of_the_surface_are_flagged(error):
+    """The surface reflectance of the face changes by 0.001."""
+    names = _names(12)
+    conditions = ["normal"] * 12 + ["lotion"] * 12
+    cohort, basis = _planted(names * 2, conditions=conditions)
+    values = 0.03 + np.repeat([0.0, 0.001], 12)[:, None]
+    dims = ("take", "region")
+    cohort = cohort.assign(
+        region_surface_reflectance=(dims, values),
+        region_surface_reflectance_error=(dims, np.full((24, 1), error)),
+    ).assign_coords(region=["face"])
+    flags = _space((cohort, basis), "condition").attrs["flags"]
+    expected = "the reliability of the surface reflectance of the face is 0.00"
+    assert any(flag.endswith(expected) for flag in flags) == (error == 0.002)
+
+
 def test_brdf_space__the_unit_is_the_subject():
     """Ten takes of one subject count as one; otherwise, two groups would differ."""
     subjects = ["S00"] * 10 + _names(12)[1:]
