@@ -43,6 +43,7 @@ from skindb.errors import Fault, InputError, require
 from skindb.numerics.inference import (
     Effects,
     effects,
+    known_effects,
     paired_effects,
     permutation_p,
     sign_flip_p,
@@ -383,8 +384,13 @@ def contrast_test(
     values = np.where(able, values, np.float32(np.nan))
     draws: dict[str, Any] = {"max_draws": permutations, "rng": rng}
     if contrast.is_paired:
-        fit = paired_effects(values)
-        *found, count = sign_flip_p(values, **draws)
+        errors = contrast.quantities.errors
+        if len(values) == 1 and errors is not None:
+            fit = known_effects(values[0], errors[0])
+            found, count = [np.full_like(fit.slope, np.nan)] * 2, 0
+        else:
+            fit = paired_effects(values)
+            *found, count = sign_flip_p(values, **draws)
         low, high = (
             fit.slope + np.copysign(np.hypot(end - fit.slope, contrast.even), side)
             for end, side in ((fit.low, -1), (fit.high, 1))
@@ -456,7 +462,7 @@ def _few_subjects(contrast: Contrast) -> list[str]:
         text += f" with and {counts[1]} without"
     else:
         counts = counts[:1]
-    if min(counts) >= FEW:
+    if min(counts) >= FEW or len(contrast.regressor) == 1:
         return []
     return [f"{text}; with fewer than {FEW} the intervals assume normal values"]
 

@@ -47,13 +47,15 @@ if TYPE_CHECKING:
 SIGNIFICANT = 0.05  # of adjusted p values
 MAX_LISTED = 6  # detectable differences that are named in a line
 SIDES = ("with", "without")
-COLUMNS = (
-    variables.EFFECT,
-    variables.EFFECT_LOW,
-    variables.EFFECT_HIGH,
+INTERVAL = (variables.EFFECT, variables.EFFECT_LOW, variables.EFFECT_HIGH)
+PERCENT = (
     variables.EFFECT_PERCENT,
     variables.EFFECT_PERCENT_LOW,
     variables.EFFECT_PERCENT_HIGH,
+)
+COLUMNS = (
+    *INTERVAL,
+    *PERCENT,
     variables.EFFECT_RELIABILITY,
     variables.EFFECT_P,
     variables.EFFECT_P_ADJUSTED,
@@ -74,7 +76,8 @@ def group_effects(
     """Differences between groups of subjects in all measured quantities.
 
     Subjects are compared in the condition normal, each with the mean of its takes.
-    Conditions are compared within the subjects who were measured in both.
+    Conditions are compared within the subjects who were measured in both; if it is only
+    one, intervals are of the errors of its fits and repeats, without p values.
 
     Parameters
     ----------
@@ -246,12 +249,12 @@ def _flags(comparison: Comparison, statistics: dict[str, Array]) -> list[str]:
         (statistics[variables.EFFECT], is_even, "even reflection may cause the effect"),
     ):
         low = [f"{names[i]} {values[i]:.2g}" for i in np.flatnonzero(where)]
-        if low:
+        if low and len(contrast.regressor) > 1:
             flags.append(
                 f"{contrast.name}: no p values where {reason}: {', '.join(low)}"
             )
     smallest = comparison.smallest_p
-    if smallest >= SIGNIFICANT:
+    if smallest >= SIGNIFICANT and np.isfinite(statistics[variables.EFFECT_P]).any():
         flags.append(
             f"{contrast.name}: with {len(contrast.regressor)} subjects no p value can be "
             f"below {smallest:.2g}, so that no difference can be significant at 5 %"
@@ -303,6 +306,12 @@ def describe_group_effects(table: Dataset) -> list[str]:
     contrasts = zip(table["contrast"].values, *permutations, strict=True)
     for name, count, smallest_p in contrasts:
         part = table.sel(contrast=name)
+        if part[variables.EFFECT_COUNT].sum("side").max() == 1:
+            lines.append(
+                f"{name}: one subject, so that intervals are of the errors of its fits "
+                "and repeats, and say nothing of other subjects"
+            )
+            continue
         compared = np.isfinite(part[variables.EFFECT_P].values)
         differ = part[variables.EFFECT_P_ADJUSTED].values < SIGNIFICANT
         lines.append(
@@ -356,21 +365,26 @@ def _amount(value: float, is_log: bool) -> str:
 
 
 def plot_group_effects(table: Dataset, *, ax: Axes | None = None) -> Axes:
-    """Plot effects with their 95 % intervals in standard deviations between subjects,
-    one row per quantity.
+    """Plot effects with their 95 % intervals in standard deviations between subjects, or
+    within one subject in per cent, one row per quantity.
     """
     names = table["quantity"].values.tolist()
     ax, places = plots.axes_of_rows(names, ax)
     ax.axvline(0, color="0.6", linewidth=1)
     contrasts = table["contrast"].values.tolist()
+    is_standardised = bool(table[variables.EFFECT_STANDARDISED].notnull().any())
+    unit = "standard deviations between subjects" if is_standardised else "%"
     for i, contrast in enumerate(contrasts):
         part = table.sel(contrast=contrast)
-        scale = part[variables.EFFECT] / part[variables.EFFECT_STANDARDISED]
-        names_of_effects = [
-            variables.EFFECT,
-            variables.EFFECT_LOW,
-            variables.EFFECT_HIGH,
-        ]
+        shown = part[list(INTERVAL)]
+        if is_standardised:
+            shown = shown / (
+                part[variables.EFFECT] / part[variables.EFFECT_STANDARDISED]
+            )
+        else:
+            shown = part[list(PERCENT)].rename(
+                dict(zip(PERCENT, INTERVAL, strict=True))
+            )
         colour = plots.CYCLE[i % len(plots.CYCLE)]
         marker = "osD^v"[i % 5]
         count = int(part[variables.EFFECT_COUNT].sum("side").max())
@@ -378,7 +392,7 @@ def plot_group_effects(table: Dataset, *, ax: Axes | None = None) -> Axes:
         ax.plot([], [], marker, color=colour, markersize=4, label=label)
         plots.significant_intervals(
             ax,
-            part[names_of_effects] / scale,
+            shown,
             variables.EFFECT,
             places + 0.6 * ((i + 0.5) / len(contrasts) - 0.5),
             part[variables.EFFECT_P_ADJUSTED].values < SIGNIFICANT,
@@ -387,9 +401,7 @@ def plot_group_effects(table: Dataset, *, ax: Axes | None = None) -> Axes:
         )
     adjusted = ", ".join(table.attrs["adjust"])
     held = f", {adjusted} held fixed" if adjusted else ""
-    ax.set_xlabel(
-        f"effect, 95 % CI [standard deviations between subjects]{held}\nfilled: adjusted p < 0.05"
-    )
+    ax.set_xlabel(f"effect, 95 % CI [{unit}]{held}\nfilled: adjusted p < 0.05")
     plots.legend_above(ax)
     return ax
 

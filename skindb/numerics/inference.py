@@ -177,6 +177,16 @@ def paired_effects(differences: Array) -> Effects:
     return _effects(mean, error, spread, freedom)
 
 
+def known_effects(slope: Array, error: Array) -> Effects:
+    """Effects (q,) with known standard errors, such as differences within one subject;
+    `spread` is NaN.
+    """
+    slope = np.where(np.isfinite(error), slope, np.nan)
+    return _effects(
+        slope, error, np.full_like(error, np.nan), np.full_like(error, np.inf)
+    )
+
+
 def _effects(slope: Array, error: Array, spread: Array, freedom: Array) -> Effects:
     half = stats.t.ppf((1 + CONFIDENCE) / 2, freedom) * error
     statistic = np.where(np.isnan(slope), np.nan, _ratio(slope, error))

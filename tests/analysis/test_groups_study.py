@@ -156,25 +156,34 @@ def test_group_effects__conditions_are_compared_within_subjects():
     assert one["effect_high"] - one["effect_low"] < 0.01
     # all 2^8 signs: the observed one and its opposite
     assert one["effect_p"] == pytest.approx(2 / 256)
-    with_one = planted_tables(
-        [*who, "S00"],
-        conditions=[*conditions, "hot"],
-        albedo=[*change, 0.0],
-        spread=0.1,
+
+
+def test_group_effects__of_conditions_are_not_adjusted():
+    cohort = planted_tables(["S00"] * 2, conditions=["normal", "lotion"])
+    message = "adjust: conditions are compared within subjects.*omit this option"
+    with pytest.raises(InputError, match=message):
+        _compare(cohort, "condition", adjust=["gender"])
+
+
+def test_group_effects__of_one_subject_have_the_intervals_of_its_errors(tmp_path):
+    cohort = planted_tables(
+        ["S00"] * 4 + ["S01"],
+        conditions=["normal"] * 2 + ["lotion"] * 2 + ["powder"],
+        albedo=[0.0, 0.0, 0.01, 0.01, 0.0],
+        spread=0.0,
     )
-    with_one = _compare(with_one, "condition")
-    assert with_one["contrast"].values.tolist() == ["lotion less normal"]
-    assert (
-        "hot less normal: excluded, paired differences need at least two subjects"
-        in with_one.attrs["flags"]
-    )
-    with pytest.raises(
-        InputError,
-        match=r"adjust: conditions are compared within subjects.*omit this option",
-    ):
-        _compare(
-            planted_tables(who, conditions=conditions), "condition", adjust=["gender"]
-        )
+    error = 0.004
+    cohort["region_diffuse_reflectance_error"][:] = error
+    table = _compare(cohort, "condition")
+    assert table["contrast"].values.tolist() == ["lotion less normal"]
+    one = table.sel(contrast="lotion less normal", quantity=FACE_R)
+    assert one["effect"] == pytest.approx(0.01, abs=0.003)  # noise of four takes
+    # the mean of two takes in both conditions
+    half = stats.norm.ppf(0.975) * np.hypot(error, error) / np.sqrt(2)
+    assert one["effect_high"] - one["effect"] == pytest.approx(half)
+    assert not table["effect_p"].notnull().any()
+    assert any("one subject" in line for line in describe_group_effects(table))
+    plot_group_effects(table).figure.savefig(tmp_path / "a.png")
 
 
 def test_group_effects__two_takes_of_a_subject_are_one_subject():
