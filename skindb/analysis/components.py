@@ -276,7 +276,8 @@ def _fit(faces: Array, design: Array, blocks: Sequence[Mask], k: int) -> dict[st
     n, _, texels = faces.shape
     mean = faces.mean(axis=0)
     faces = faces - mean
-    inner = np.stack([_inner(faces[:, rows]) for rows in blocks])
+    parts = [faces[:, rows].reshape(n, -1).astype(float) for rows in blocks]
+    inner = np.stack([part @ part.T for part in parts])
     regressors = np.column_stack([np.ones(n), design - design.mean(axis=0)])
     k = min(k, n - int(np.linalg.matrix_rank(regressors)) - 1)
     require(
@@ -311,12 +312,6 @@ def _fit(faces: Array, design: Array, blocks: Sequence[Mask], k: int) -> dict[st
             mean.size, k, noise, determinant, square + outside / noise
         ),
     }
-
-
-def _inner(vectors: Array) -> Array:
-    """Inner products (n, n) of vectors (n, ...)."""
-    flat = vectors.reshape(len(vectors), -1).astype(float)
-    return np.asarray(flat @ flat.T)
 
 
 class Modes(NamedTuple):
@@ -520,6 +515,9 @@ def write_face_model(model: Dataset, path: Path) -> None:
     with h5py.File(private_file(path), "w") as file:
         for name, values in arrays.items():
             file[name] = values
+        for group in file.values():
+            kind = {"name": "skindb", "datasetType": "POLYGON_MESH"}
+            group["representer"].attrs.update(kind)
 
 
 def _exported(model: Dataset) -> dict[str, Any]:
@@ -531,7 +529,7 @@ def _exported(model: Dataset) -> dict[str, Any]:
     right = [number[:-1, 1:], number[1:, :-1], number[1:, 1:]]
     cells = np.hstack([np.reshape(half, (3, -1)) for half in (left, right)])
     cells = cells[:, (cells >= 0).all(axis=0)]
-    arrays: dict[str, Any] = {"version/majorVersion": 0, "version/minorVersion": 9}
+    arrays: dict[str, Any] = {}
     for name in model["block"].values.tolist():
         rows = _rows(model["quantity"].values.tolist(), name)
         block = BLOCKS[name]
@@ -543,6 +541,8 @@ def _exported(model: Dataset) -> dict[str, Any]:
         scale = model[variables.FACE_SCALE].values[rows][0] * slope
         noise = model[variables.NOISE_VARIANCE].values * np.mean(scale**2)
         arrays |= {
+            f"{block.exported}/version/majorVersion": np.int32(0),
+            f"{block.exported}/version/minorVersion": np.int32(9),
             f"{block.exported}/model/mean": np.float32(values.ravel()),
             f"{block.exported}/model/pcaBasis": np.float32(basis.T / length),
             f"{block.exported}/model/pcaVariance": np.float32(length**2),

@@ -270,15 +270,13 @@ def _canonical(H: Array, mean: Array) -> Array:
 
 @dataclass(frozen=True)
 class Components:
-    """Mean and principal axes of vectors, and the scores of each vector."""
+    """Mean and principal axes of vectors."""
 
     mean: Array  # (d,)
     # (c, d) of unit norm, by decreasing variance; the largest entry of each is positive
     axes: Array
-    score: Array  # (n, c)
     variance: Array  # (c,) unbiased variance of the scores
     total: float  # sum of the variances of all entries
-    residual: Array  # (n,) root mean square of the residual of each vector
 
 
 def principal_axes(vectors: Sequence[Array], max_components: int) -> Components:
@@ -312,18 +310,14 @@ def principal_axes(vectors: Sequence[Array], max_components: int) -> Components:
     places = places[:, ::-1][:, :rank]
     length = np.sqrt(values[:rank])
     axes = np.empty((rank, d))
-    residual = np.zeros(n)
     for block in blocks:
         x = np.stack([vector[block] for vector in vectors]) - mean[block]
         axes[:, block] = (places / length).T @ x
-        residual += ((x - (places * length) @ axes[:, block]) ** 2).sum(axis=1)
     largest = np.abs(axes).argmax(axis=1)
     sign = np.where(axes[np.arange(rank), largest] < 0, -1.0, 1.0)
     return Components(
         mean,
         axes * sign[:, None],
-        places * (length * sign),
         variance=values[:rank] / (n - 1),
         total=float(np.trace(inner)) / (n - 1),
-        residual=np.sqrt(residual / d),
     )

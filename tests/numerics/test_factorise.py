@@ -182,14 +182,7 @@ def test_principal_axes__are_those_of_scikit_learn(n, d, block, monkeypatch):
     np.testing.assert_allclose(
         np.abs((found.axes * oracle.components_).sum(axis=1)), 1.0, atol=1e-9
     )
-    np.testing.assert_allclose(
-        np.abs(found.score), np.abs(oracle.transform(x)), atol=1e-7
-    )
     np.testing.assert_allclose(found.total, x.var(axis=0, ddof=1).sum(), rtol=1e-9)
-    left = x - oracle.inverse_transform(oracle.transform(x))
-    np.testing.assert_allclose(
-        found.residual, np.sqrt((left**2).mean(axis=1)), atol=1e-7
-    )
     assert (
         found.axes[np.arange(len(found.axes)), np.abs(found.axes).argmax(axis=1)] > 0
     ).all()
@@ -198,9 +191,7 @@ def test_principal_axes__are_those_of_scikit_learn(n, d, block, monkeypatch):
 def test_principal_axes__of_equal_vectors_has_no_component():
     found = principal_axes(np.ones((4, 3), np.float32), 5)
     assert found.axes.shape == (0, 3)
-    assert found.score.shape == (4, 0)
     assert found.total == 0
-    assert (found.residual == 0).all()
 
 
 # extreme inputs
@@ -277,6 +268,6 @@ def test_principal_axes__rebuild_vectors_of_any_scale():
     for scale in SCALES:
         x = scale * np.random.default_rng(0).standard_normal((6, 500))
         axes = principal_axes(x, 5)
-        rebuilt = axes.mean + axes.score @ axes.axes
+        rebuilt = axes.mean + (x - axes.mean) @ axes.axes.T @ axes.axes
         np.testing.assert_allclose(rebuilt, x, atol=1e-10 * scale)
         np.testing.assert_allclose(axes.axes @ axes.axes.T, np.eye(5), atol=1e-10)
