@@ -128,7 +128,14 @@ def test_face_model__finds_planted_modes_and_slopes(model):
     assert error < 3 * np.sqrt(MODES) / (14 * np.sqrt(60))
     assert np.sqrt(np.mean((slope / SPREAD) ** 2)) == pytest.approx(PER_YEAR, rel=0.5)
     assert list(model["block"].values) == list(BLOCKS)
-    assert model["mode_variance_ratio"].sum("mode").values == pytest.approx(1, abs=0.02)
+    ratio = model["mode_variance_ratio"]
+    assert ratio.sum("mode").values == pytest.approx(1, abs=0.02)
+    # Tipping and Bishop: the variance of a mode less that of the noise
+    square = ((model["face_mode"] / model["face_scale"]) ** 2).sum(
+        ["quantity", "v", "u"]
+    )
+    noise = float(model["noise_variance"])
+    assert (ratio.sum("block") - square).values == pytest.approx(noise, rel=0.05)
 
 
 def test_condition__equals_the_conditional_mean_of_the_covariance(model):
@@ -271,6 +278,14 @@ def test_face_model__takes_of_a_subject_count_once_and_others_are_left_out():
         f"T{i}" for i in (0, 2, 3, 4, 6, 7, 8, 9, 10)
     ]
     assert found.sizes["mode"] == 9 - 2 - 1
+    vectors = [face_vector(cohort.isel(take=i)).values[3:] for i in range(12)]
+    faces = [
+        (vectors[0] + vectors[1]) / 2,
+        *(vectors[i] for i in (2, 3, 4, *range(6, 11))),
+    ]
+    np.testing.assert_allclose(
+        found["face_mean"][3:], np.mean(faces, axis=0), rtol=1e-4
+    )
     assert "fewer than 20 subjects" in " ".join(describe_face_model(found))
     with pytest.raises(InputError, match="needs 5 subjects"):
         face_model(cohort.isel(take=slice(0, 5)), rng=np.random.default_rng(0))
