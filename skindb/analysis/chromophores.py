@@ -24,7 +24,6 @@ from sklearn.exceptions import ConvergenceWarning
 from xarray import Dataset
 
 from skindb import plots
-from skindb.analysis.quantities import Quantities
 from skindb.analysis.regions import map_regions
 from skindb.analysis.study import (
     Population,
@@ -43,7 +42,7 @@ from skindb.analysis.texture import (
     covered_fractions,
 )
 from skindb.errors import require
-from skindb.numerics.statistics import SUMMARY, Moments
+from skindb.numerics.statistics import SUMMARY
 from skindb.parameters import group_option, seed_option
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
@@ -314,11 +313,7 @@ def chromophore_table(
     groups = grouped(cohort, group_by)
     values = statistics[variables.TAKE_CHROMOPHORE]
     takes = groups.takes["take"].values.tolist()
-    of_takes = Quantities(values.sel(take=takes).values, groups.subject)
-    moments = Moments.stacked(
-        Moments.of(of_takes.select(rows).of_subjects().values)
-        for rows in groups.members.values()
-    )
+    moments = groups.moments(values.sel(take=takes).values)
     return dataset(
         moments.summary("group_chromophore"),
         coords={

@@ -154,7 +154,7 @@ class Quantities:
             np.array([name == subject for subject in self.subject]) for name in names
         ]
         values = np.stack([known_mean(self.values[rows]) for rows in takes])
-        repeated = _within_deviation(self.values, takes)
+        repeated = within_deviation(self.values, self.subject)
         errors = self.errors
         if errors is not None or np.isfinite(repeated).any():
             count = np.stack(
@@ -195,14 +195,15 @@ def _mean_error(errors: Array) -> Array:
     return np.asarray(np.sqrt(known_mean(errors**2) / np.maximum(count, 1)))
 
 
-def _within_deviation(values: Array, takes: Sequence[Mask]) -> Array:
-    """Standard deviation (q,) of the takes of one subject, from values (n, q); NaN where
+def within_deviation(values: Array, subject: Sequence[str]) -> Array:
+    """Standard deviation (...) of the takes of one subject, from values (n, ...); NaN where
     fewer than three subjects have two.
     """
-    second, free, repeated = np.zeros((3, values.shape[1]))
-    for rows in takes:
-        if rows.sum() > 1:
-            moments = Moments.of(values[rows])
+    second, free, repeated = np.zeros((3, *values.shape[1:]))
+    names = np.array(subject)
+    for name in dict.fromkeys(subject):
+        if (names == name).sum() > 1:
+            moments = Moments.of(values[names == name])
             second += moments.second
             free += np.maximum(moments.count - 1, 0)
             repeated += moments.count > 1

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 from xarray import Dataset
 
 from skindb import plots
@@ -143,12 +144,10 @@ def _statistics(
     ):
         return statistics
     one_way = intraclass_correlation(values[known], subjects[known])
-    columns = sorted(set(occasions))
-    table = np.full((len(of_subject), len(columns)), np.nan)
-    numbers = {name: i for i, name in enumerate(of_subject)}
-    for name, occasion, value in zip(measured.subject, occasions, values, strict=True):
-        table[numbers[name], columns.index(occasion)] = value
-    agreement = agreement_correlation(table[np.isfinite(table).all(axis=1)])
+    columns = [measured.subject, *zip(*occasions, strict=True)]
+    keys = pd.MultiIndex.from_arrays(columns)
+    table = pd.Series(values, keys).unstack([1, 2]).dropna()
+    agreement = agreement_correlation(table.to_numpy())
     coefficient = NORMAL_95 * np.sqrt(2) * one_way.within
     change = np.array([x[1] - x[0] for x in repeated])
     half = NORMAL_95 * change.std(ddof=1)

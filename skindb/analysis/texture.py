@@ -36,7 +36,6 @@ MAPPED = (variables.TEXEL_DIFFUSE_REFLECTANCE, variables.TEXEL_COVERAGE)
 LEAST_COVERED = 0.5  # fraction of the texels of a region that a take must have measured
 COVERED = 0.5  # coverage above which a texel counts as measured
 DARKEST = 1e-3  # lower limit of R_d; the logarithm of smaller values is mostly noise
-AXES = 3
 ITERATIONS = 5
 # standard deviation of the Gaussian that blends a region's edge, in units of (u, v):
 # about 5 mm on a face

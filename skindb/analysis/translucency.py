@@ -6,20 +6,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from xarray import Dataset
 
 from skindb import plots
 from skindb.analysis.contrasts import FEW
-from skindb.analysis.quantities import trusted
+from skindb.analysis.quantities import trusted, within_deviation
 from skindb.analysis.study import Population, Results, Study, table_of
 from skindb.analysis.subjects import Groups, grouped
 from skindb.errors import require
-from skindb.numerics.statistics import (
-    SUMMARY,
-    intraclass_correlation,
-    known_mean,
-)
+from skindb.numerics.statistics import SUMMARY, known_mean
 from skindb.parameters import group_option
 from skindb.schema import ProbeStatus, dataset, variables
 from skindb.schema.cohort import require_comparable
@@ -70,7 +65,8 @@ def translucency_table(cohort: Dataset, *, group_by: str | None = None) -> Datas
         variance that the noise of the fibres does not explain: differences between
         people and, because the probe is never placed identically, within people.
         `sigma_tr_repeat_deviation` is the standard deviation between the takes of one
-        subject, from the pooled variance of subjects with several takes in a group. The
+        subject, from the pooled variance of subjects with several takes in a group, of
+        whom there must be three. The
         intervals do not include model errors that are common to all
         takes. Attribute "statuses": number of profiles of each status.
 
@@ -102,9 +98,8 @@ def translucency_table(cohort: Dataset, *, group_by: str | None = None) -> Datas
     variance = moments.variance
     measurement_error = _rms(groups, noise)
     explained = measurement_error**2 / np.where(variance > 0, variance, np.nan)
-    subjects = np.array(groups.subject)
     repeats = [
-        _repeat_deviation(sigma_tr[rows], subjects[rows])
+        within_deviation(sigma_tr[rows], [groups.subject[row] for row in rows])
         for rows in groups.members.values()
     ]
     return dataset(
@@ -152,20 +147,6 @@ def _statuses(takes: Dataset) -> dict[str, int]:
         if member != ProbeStatus.NOT_MEASURED
     }
     return {name: count for name, count in counts.items() if count}
-
-
-def _repeat_deviation(values: Array, subjects: NDArray[np.str_]) -> Array:
-    """Standard deviation (site, channel) between the takes of one subject, from values
-    (take, site, channel).
-    """
-    out = np.full(values.shape[1:], np.nan)
-    for index in np.ndindex(out.shape):
-        is_known = np.isfinite(values[:, *index])
-        people = len(set(subjects[is_known].tolist()))
-        if people >= 2 and is_known.sum() > people:
-            repeats = values[is_known, *index]
-            out[index] = intraclass_correlation(repeats, subjects[is_known]).within
-    return out
 
 
 def _rms(groups: Groups, errors: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Statistics of populations: mergeable moments, intervals, false discoveries, power, and
+"""Statistics of populations: moments, intervals, false discoveries, power, and
 correlations within subjects; the unit of observation is a subject.
 """
 
@@ -40,9 +40,7 @@ def robust_deviation(
 
 @dataclass(frozen=True)
 class Moments:
-    """Count, mean and centred second moment along the first axis; moments of parts of a
-    population can be added (Chan et al. 1979).
-    """
+    """Count, mean and centred second moment along the first axis."""
 
     count: Array
     mean: Array
@@ -63,13 +61,6 @@ class Moments:
         """Moments of several sets, along a new first axis."""
         columns = ((part.count, part.mean, part.second) for part in parts)
         return cls(*map(np.stack, zip(*columns, strict=True)))
-
-    def __add__(self, other: Moments) -> Moments:
-        count = self.count + other.count
-        fraction = other.count / np.maximum(count, 1.0)
-        step = other.mean - self.mean
-        second = self.second + other.second + step**2 * self.count * fraction
-        return Moments(count, self.mean + step * fraction, second)
 
     @property
     def variance(self) -> Array:
