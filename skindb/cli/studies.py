@@ -45,6 +45,13 @@ if TYPE_CHECKING:
 ANALYSIS = Path(skindb.__file__).parent / "analysis"
 # of every study, after its own parameters
 STORED = (
+    click.option(
+        "--as-normal",
+        default="",
+        metavar="NAME,...",
+        help="Conditions, separated by commas, that count as normal for subjects who "
+        "have no take in the condition normal: makeup.",
+    ),
     RELEASE,
     click.option(
         "--name",
@@ -202,6 +209,7 @@ def _run_study(
     *,
     takes: tuple[str, ...],
     parameters: Any,
+    as_normal: str,
     release: str | None,
     name: str | None,
     csv: Path | None,
@@ -238,7 +246,13 @@ def _run_study(
             workflow.computing_on(client, database.folder),
         ):
             results = workflow.study(
-                database, study.name, takes=takes, release=release, name=name, **chosen
+                database,
+                study.name,
+                takes=takes,
+                as_normal=as_normal.replace(",", " ").split(),
+                release=release,
+                name=name,
+                **chosen,
             )
         progress(f"analyze {study.name}", 1, 1)
         if faces:

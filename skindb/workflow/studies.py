@@ -38,7 +38,7 @@ from skindb.reflectance.brdf_files import read_dictionary
 from skindb.reflectance.dictionary import convolve_disc, embedded_dictionary
 from skindb.reflectance.kinds import require_mixture
 from skindb.schema import variables
-from skindb.schema.cohort import require_same_fit
+from skindb.schema.cohort import NORMAL, require_same_fit
 from skindb.schema.notes import Note, note, unique_notes
 from skindb.store import STUDY, Database, Lookup, Record, Staleness, require_text
 from skindb.threads import on_one_blas_thread
@@ -93,6 +93,7 @@ def open_population(
     study: Study,
     *,
     takes: Sequence[str] = (),
+    as_normal: Sequence[str] = (),
     release: str | None = None,
     dictionary: Path | None = None,
 ) -> tuple[Population, list[Record]]:
@@ -106,6 +107,8 @@ def open_population(
         The study.
     takes
         Default all whose consent covers statistics.
+    as_normal
+        See `study`.
     release
         Name of a release to study; default the newest versions.
     dictionary
@@ -114,7 +117,9 @@ def open_population(
     if study.registers:
         require_covered(db, release)
     _require_models(db, takes, release)
-    opened = partial(_opened, db, release=release, mixed_fits=bool(takes))
+    opened = partial(
+        _opened, db, release=release, mixed_fits=bool(takes), as_normal=as_normal
+    )
     open_models = partial(opened, takes=takes or None)
     if study.layout != "maps":
         cohort = open_models(study.layout, **study.cohort_options)
@@ -155,9 +160,26 @@ def open_population(
     return population, [*_models(db, cohort), *registrations.values()]
 
 
-def _opened(db: Database, layout: Any, *, mixed_fits: bool, **options: Any) -> Dataset:
-    """A cohort that states whether its takes may be fitted with different parameters."""
-    return db.cohort(layout, **options).assign_attrs(mixed_fits=mixed_fits)
+def _opened(
+    db: Database,
+    layout: Any,
+    *,
+    mixed_fits: bool,
+    as_normal: Sequence[str],
+    **options: Any,
+) -> Dataset:
+    """A cohort that states whether its takes may be fitted with different parameters, and
+    in which some conditions count as normal for subjects without a normal take.
+    """
+    cohort = db.cohort(layout, **options).assign_attrs(mixed_fits=mixed_fits)
+    if not as_normal:
+        return cohort
+    condition, subject = (cohort[name].values for name in (CONDITION, "subject"))
+    has_normal = np.isin(subject, subject[condition == NORMAL])
+    counts = np.isin(condition, list(as_normal)) & ~has_normal
+    return cohort.assign_coords(
+        {CONDITION: ("take", np.where(counts, NORMAL, condition))}
+    )
 
 
 def _require_models(db: Database, takes: Sequence[str], release: str | None) -> None:
@@ -328,6 +350,7 @@ def study(
     what: str,
     *,
     takes: Sequence[str] = (),
+    as_normal: Sequence[str] = (),
     release: str | None = None,
     name: str | None = None,
     **parameters: Any,
@@ -343,6 +366,9 @@ def study(
     takes
         Default all whose consent covers statistics. Takes that are named may be fitted
         with different parameters.
+    as_normal
+        Conditions, such as makeup, that count as normal for subjects who have no take in
+        the condition normal.
     release
         Name of a release to study; default the newest versions.
     name
@@ -372,12 +398,27 @@ def study(
     requested = {name: _plain(value) for name, value in asdict(chosen).items()}
     requested.pop("dictionary", None)
     requested |= {"takes": [*takes], "release": release or ""}
+    if as_normal:
+        requested["as_normal"] = [*as_normal]
     key = study_key(record, requested, name)
     dictionary = parameters.get("dictionary")
     studied = takes or db.takes("model", release=release)
+    conditions = sorted({[*take.split("."), NORMAL][1] for take in studied})
+    require(
+        {*as_normal} <= {*conditions},
+        f"conditions {', '.join(as_normal)} as normal",
+        f"must be among {', '.join(conditions)}",
+        "another word",
+        "correct it",
+    )
     with logged_action(db, "study", studied, what=record.name):
         population, inputs = open_population(
-            db, record, takes=takes, release=release, dictionary=dictionary
+            db,
+            record,
+            takes=takes,
+            as_normal=as_normal,
+            release=release,
+            dictionary=dictionary,
         )
         _require_one_scale(db, record, inputs)
         derivation = _derivation(db, key, record, requested, population, inputs)
@@ -426,7 +467,7 @@ def study_key(record: Study, requested: Attributes, name: str | None) -> str:
     """
     if name is not None:
         return f"{record.name}.{require_text(name, STUDY_NAME, 'name of a study')}"
-    defaults = {"takes": [], "release": ""} | {
+    defaults = {"takes": [], "as_normal": [], "release": ""} | {
         spec.name: _plain(spec.default) for spec in fields(record.parameters)
     }
     chosen = {
@@ -460,7 +501,8 @@ def study_function(record: Study) -> Callable[..., DataTree]:
         parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
         for parameter in inspect.signature(record.parameters).parameters.values()
     ]
-    keywords += [general[name] for name in ("takes", "release", "name")]
+    shared = ("takes", "as_normal", "release", "name")
+    keywords += [general[name] for name in shared]
     function.__signature__ = inspect.Signature([general["db"], *keywords])  # type: ignore[attr-defined]
     function.__name__ = function.__qualname__ = record.name
     helps = "".join(
@@ -470,7 +512,7 @@ def study_function(record: Study) -> Callable[..., DataTree]:
     function.__doc__ = (
         f"Study of the population: {record.description}; see `skindb.workflow.study`.\n\n"
         "    Parameters\n    ----------\n    db\n        Database with models.\n"
-        f"{helps}    takes, release, name\n        As in `skindb.workflow.study`.\n    "
+        f"{helps}    {', '.join(shared)}\n        As in `skindb.workflow.study`.\n    "
     )
     return function
 

@@ -168,7 +168,7 @@ def repeat_study(
     cure = "run skindb analyze"
     require(study_name in STUDIES, key, rule, f"the study {study_name!r}", cure)
     accepted = {spec.name for spec in fields(STUDIES[study_name].parameters)}
-    if unknown := sorted(options.keys() - {*accepted, "takes", "release"}):
+    if unknown := sorted(options.keys() - {*accepted, "takes", "as_normal", "release"}):
         raise input_error(key, rule, f"the parameters {', '.join(unknown)}", cure)
     release = options.pop("release", "") or None
     takes = options.pop("takes", [])

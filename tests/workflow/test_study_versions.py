@@ -8,8 +8,10 @@ import pytest
 from planted_population import TABLES, population
 
 from skindb import workflow
+from skindb.errors import InputError
 from skindb.store import Database
 from skindb.workflow import studies
+from skindb.workflow.upkeep import repeat_study
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -90,6 +92,27 @@ def test_made__computed_again_after(db, change_code, change):
 def test_made__another_seed_is_another_generation(db):
     assert workflow.traits(db, k=3, seed=1).attrs["generation"] == 2
     assert workflow.traits(db, k=3, seed=1).attrs["generation"] == 2
+
+
+def test_subjects_without_a_normal_take_are_skipped_unless_their_condition_is_chosen(
+    db,
+):
+    takes = ["A.lotion", "B", "C"]
+    usual = workflow.translucency(db, takes=takes)
+    assert usual.attrs["skipped"][0]["take"] == "A"
+    chosen = workflow.translucency(db, takes=takes, as_normal=["lotion"])
+    counts = [
+        int(tree["translucency_table"]["sigma_tr_count"].max())
+        for tree in (usual, chosen)
+    ]
+    assert counts == [2, 3]
+    assert not chosen.attrs["skipped"]
+    # a subject with a normal take is not affected
+    assert workflow.translucency(db, as_normal=["lotion"]).attrs["skipped"] == []
+    again = repeat_study(db, chosen.attrs["study"], chosen.attrs["parameters"])
+    assert again.generation == 1
+    with pytest.raises(InputError, match="must be among lotion, normal"):
+        workflow.translucency(db, as_normal=["glue"])
 
 
 def test_attributes_digest__is_of_what_takes_are_said_to_be(db):
