@@ -187,7 +187,7 @@ def _subject_faces(cohort: Dataset, adjust: Sequence[str]) -> Faces:
         note(subjects.take[i], f"only {fraction[i]:.0%} of its texels are known")
         for i in np.flatnonzero(fraction < LEAST_KNOWN)
     ]
-    faces = vectors.values[rows][..., used]
+    faces = np.stack([vectors.values[row][:, used] for row in rows])
     faces[:, :3] = _aligned(faces[:, :3])
     subjects = subjects.select(rows)
     terms, design = _design(subjects, adjust)
@@ -276,8 +276,7 @@ def _fit(faces: Array, design: Array, blocks: Sequence[Mask], k: int) -> dict[st
     n, _, texels = faces.shape
     mean = faces.mean(axis=0)
     faces = faces - mean
-    parts = [faces[:, rows].reshape(n, -1).astype(float) for rows in blocks]
-    inner = np.stack([part @ part.T for part in parts])
+    inner = np.stack([_inner(faces[:, rows]) for rows in blocks])
     regressors = np.column_stack([np.ones(n), design - design.mean(axis=0)])
     k = min(k, n - int(np.linalg.matrix_rank(regressors)) - 1)
     require(
@@ -291,13 +290,14 @@ def _fit(faces: Array, design: Array, blocks: Sequence[Mask], k: int) -> dict[st
     squares, square, outside, determinant = _left_out(inner, regressors, k)
     noise = outside.mean() / (mean.size - k)
     loading = modes.weights * np.sqrt(np.maximum(1 - noise / modes.variance, 0.0))
+    slope = np.float32(np.linalg.pinv(regressors)[1:])
     # the error of a shape is the distance of points
     channels = np.array([1, *(rows.sum() for rows in blocks[1:])])
     spread = np.einsum("nk,bnm,mk->kb", modes.weights, inner, modes.weights)
     return {
         variables.FACE_MEAN: mean,
-        variables.FACE_MODE: np.tensordot(loading.T, faces, 1),
-        variables.FACE_SLOPE: np.tensordot(np.linalg.pinv(regressors)[1:], faces, 1),
+        variables.FACE_MODE: np.tensordot(np.float32(loading.T), faces, 1),
+        variables.FACE_SLOPE: np.tensordot(slope, faces, 1),
         variables.TERM_MEAN: design.mean(axis=0),
         variables.FACE_SCALE: modes.scale @ np.array(blocks),
         variables.NOISE_VARIANCE: noise,
@@ -312,6 +312,12 @@ def _fit(faces: Array, design: Array, blocks: Sequence[Mask], k: int) -> dict[st
             mean.size, k, noise, determinant, square + outside / noise
         ),
     }
+
+
+def _inner(vectors: Array) -> Array:
+    """Inner products (n, n) of vectors (n, ...)."""
+    flat = vectors.reshape(len(vectors), -1).astype(float)
+    return np.asarray(flat @ flat.T)
 
 
 class Modes(NamedTuple):

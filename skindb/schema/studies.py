@@ -370,10 +370,6 @@ FACE_DISTANCE = declare(
     "float64 face_model/face_distance(subject) [1]",
     "Mahalanobis distance within the modes of the other subjects",
 )
-FACE_DISTANCE_P = declare(
-    "float64 face_model/face_distance_p(subject) [1]",
-    "probability of a larger distance (Hotelling)",
-)
 FACE_LOG_DENSITY = declare(
     "float64 face_model/face_log_density(subject) [1]",
     "log density of the scaled face in the model of the other subjects",
