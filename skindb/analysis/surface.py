@@ -104,6 +104,7 @@ def brdf_space(
     basis: Dataset,
     tables: Array | Delayed,
     group_by: str,
+    pairs: Sequence[str] = (),
     permutations: int = 10_000,
     rng: Generator,
 ) -> Dataset:
@@ -131,6 +132,8 @@ def brdf_space(
         Attribute or trait; see `skindb.analysis.groups_by`. Takes without it are
         excluded, and so are takes in other conditions than normal unless conditions are
         compared.
+    pairs
+        Names of the pairs of interest, such as "normal to lotion"; default all.
     permutations
         Maximum number of permutations for p values; if there are fewer, all of them are used.
     rng
@@ -172,11 +175,24 @@ def brdf_space(
         "check the fits",
     )
     mapped, explained, error = classical_scaling(distance)
-    pairs = [
-        _compared_pair(subjects, pair, permutations, rng)
+    possible = {
+        " to ".join(subjects.groups[i] for i in pair): pair
         for pair in itertools.combinations(range(len(subjects.groups)), 2)
+    }
+    require(
+        possible.keys() >= {*pairs},
+        "pairs",
+        "must be of two groups",
+        ", ".join(pairs),
+        f"choose from: {', '.join(possible)}",
+    )
+    compared = [
+        _compared_pair(subjects, name, possible[name], permutations, rng)
+        for name in possible
+        if not pairs or name in pairs
     ]
-    adjusted, method = _adjusted(subjects, pairs, permutations, rng)
+    is_joint = len(compared) == len(possible)
+    adjusted, method = _adjusted(subjects, compared, permutations, rng, is_joint)
     means = known_mean(subjects.coefficient)
     averaged = brdf @ means.T
     labels = list(takes.take)
@@ -189,16 +205,16 @@ def brdf_space(
             variables.TAKE_PLACE: mapped,
             variables.EXPLAINED_FRACTION: explained,
             variables.MAP_ERROR: error,
-            variables.GROUP_DISTANCE: [pair.distance / length for pair in pairs],
-            variables.GROUP_DISTANCE_NOISE: [pair.noise / length for pair in pairs],
-            variables.GROUP_DISTANCE_P: [pair.p for pair in pairs],
+            variables.GROUP_DISTANCE: [pair.distance / length for pair in compared],
+            variables.GROUP_DISTANCE_NOISE: [pair.noise / length for pair in compared],
+            variables.GROUP_DISTANCE_P: [pair.p for pair in compared],
             variables.GROUP_DISTANCE_P_ADJUSTED: adjusted,
-            variables.PAIR_SUBJECT_COUNT: [pair.count for pair in pairs],
-            variables.PAIR_PERMUTATIONS: [pair.permutations for pair in pairs],
+            variables.PAIR_SUBJECT_COUNT: [pair.count for pair in compared],
+            variables.PAIR_PERMUTATIONS: [pair.permutations for pair in compared],
         },
         coords={
             "group": list(subjects.groups),
-            "pair": [pair.name for pair in pairs],
+            "pair": [pair.name for pair in compared],
             "side": list(SIDES),
             "take": labels,
             "take_2": labels,
@@ -209,7 +225,7 @@ def brdf_space(
             "groups_of_takes": named,
             "adjusted_by": method,
             "flags": flags
-            + [flag for pair in pairs for flag in pair.flags]
+            + [flag for pair in compared for flag in pair.flags]
             + unreliable_surfaces(cohort, group_by),
             "skipped": skipped_takes(cohort),
         },
@@ -332,7 +348,11 @@ class _Pair:
 
 
 def _compared_pair(
-    subjects: _Subjects, pair: tuple[int, int], max_draws: int, rng: Generator
+    subjects: _Subjects,
+    name: str,
+    pair: tuple[int, int],
+    max_draws: int,
+    rng: Generator,
 ) -> _Pair:
     """Compare two groups: within the subjects measured in both, if there are any."""
     values = subjects.place[:, pair]
@@ -358,7 +378,6 @@ def _compared_pair(
     step = known_mean(values[:, 0]) - known_mean(values[:, 1])
     length = float(np.linalg.norm(step))
     noise = length / np.sqrt(statistic) if statistic > 0 else np.nan
-    name = " to ".join(subjects.groups[i] for i in pair)
     return _Pair(name, within, (first, second), length, noise, p, drawn)
 
 
@@ -367,6 +386,7 @@ def _adjusted(
     pairs: Sequence[_Pair],
     max_draws: int,
     rng: Generator,
+    is_joint: bool,
 ) -> tuple[Array, str]:
     """P values adjusted for all pairs, and the method: joint permutations of all groups
     if these are valid.
@@ -375,8 +395,8 @@ def _adjusted(
     finite = np.isfinite(p)
     if finite.sum() < 2:
         return p, ONE_PAIR
-    # no single permutation scheme is valid for all pairs
-    if not finite.all() or len({pair.within for pair in pairs}) > 1:
+    # no single permutation scheme is valid for all pairs, or it has others than these
+    if not is_joint or not finite.all() or len({pair.within for pair in pairs}) > 1:
         return np.minimum(p * finite.sum(), 1.0), "Bonferroni"
     if pairs[0].within:
         _, largest, _ = within_subjects_p(subjects.place, max_draws=max_draws, rng=rng)
@@ -424,6 +444,12 @@ class Parameters:
     """Parameters of the study of surfaces."""
 
     group_by: str = compared_option()
+    pairs: tuple[str, ...] = option(
+        (),
+        "Pairs of interest, separated by commas, such as: normal to lotion.  [default: all]",
+        metavar="PAIR,...",
+        show_default=False,
+    )
     k: int = option(6, "Number of components of the common basis.", minimum=1)
     permutations: int = permutations_option()
     seed: int = seed_option("the factorisation and the permutations")
@@ -451,6 +477,7 @@ def compute(population: Population, parameters: Parameters) -> Results:
         basis=basis,
         tables=tables,
         group_by=parameters.group_by,
+        pairs=parameters.pairs,
         permutations=parameters.permutations,
         rng=rng,
     )

@@ -226,7 +226,7 @@ def _run_study(
     if csv:
         writable(csv, ".csv")
     chosen = dict(vars(parameters))
-    for several in {"adjust", "quantities"}.intersection(chosen):
+    for several in {"adjust", "quantities", "pairs"}.intersection(chosen):
         # names may contain commas, in quotes
         lines = reader(chosen[several], skipinitialspace=True)
         names = [name.strip() for line in lines for name in line]

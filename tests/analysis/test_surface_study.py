@@ -93,6 +93,20 @@ def test_brdf_space__a_planted_difference_is_found_and_nothing_else():
     )
 
 
+def test_brdf_space__pairs_of_interest_alone_are_counted():
+    group = np.array(["a", "b", "c"])[np.arange(36) % 3]
+    planted = _planted(_names(36), shift=(group == "c") * 0.1, group=group)
+    chosen = _space(planted, "group", pairs=["a to c", "b to c"])
+    assert chosen["pair"].values.tolist() == ["a to c", "b to c"]
+    assert chosen.attrs["adjusted_by"] == "Bonferroni"
+    p = chosen["group_distance_p"]
+    np.testing.assert_allclose(
+        chosen["group_distance_p_adjusted"], np.minimum(2 * p, 1)
+    )
+    with pytest.raises(InputError, match="choose from: a to b, a to c, b to c"):
+        _space(planted, "group", pairs=["c to a"])
+
+
 def test_brdf_space__distances_are_those_of_the_tables():
     """SciPy's distances of the BRDFs at every node, weighted as the metric does."""
     planted = _planted(_names(12), group=["a", "b"] * 6)
