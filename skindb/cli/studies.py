@@ -47,7 +47,6 @@ ANALYSIS = Path(skindb.__file__).parent / "analysis"
 STORED = (
     click.option(
         "--as-normal",
-        default="",
         metavar="NAME,...",
         help="Conditions, separated by commas, that count as normal for subjects who "
         "have no take in the condition normal: makeup.",
@@ -209,7 +208,7 @@ def _run_study(
     *,
     takes: tuple[str, ...],
     parameters: Any,
-    as_normal: str,
+    as_normal: str | None,
     release: str | None,
     name: str | None,
     csv: Path | None,
@@ -249,7 +248,7 @@ def _run_study(
                 database,
                 study.name,
                 takes=takes,
-                as_normal=as_normal.replace(",", " ").split(),
+                as_normal=(as_normal or "").replace(",", " ").split(),
                 release=release,
                 name=name,
                 **chosen,
