@@ -472,3 +472,24 @@ def test_group_effects__of_conditions_contain_even_reflection(
     assert np.isnan(found["effect_p"].sel(quantity="ITA face")) == is_withheld
     flags = " ".join(found.attrs["flags"])
     assert ("where even reflection may cause the effect: R_d" in flags) == is_withheld
+
+
+@pytest.mark.slow
+def test_group_effects__what_has_p_values_does_not_bias_them():
+    """200 cohorts of ten pairs without a change, whose stated errors are 0.7 of the true
+    ones: half of the quantities have p values, of which 5 % are below 0.05.
+    """
+    names = _people(10)
+    found = []
+    for seed in range(200):
+        conditions = ["normal"] * 10 + ["tan"] * 10
+        cohort = planted_tables(names * 2, conditions=conditions, seed=seed)
+        cohort["region_diffuse_reflectance_error"] *= 0.7
+        found.append(
+            _compare(cohort, "condition", quantities=["R_d"], permutations=300)
+        )
+    p = np.array([one["effect_p"].values for one in found])
+    known = p[np.isfinite(p)]
+    assert 0.3 < known.size / p.size < 0.7
+    # three standard deviations of 500 independent values
+    assert (known <= 0.05).mean() == pytest.approx(0.05, abs=0.03)
