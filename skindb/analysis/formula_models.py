@@ -6,7 +6,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import MISSING, dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +18,7 @@ from xarray import Dataset
 
 from skindb import plots
 from skindb.analysis.contrasts import MIN_RELIABILITY
+from skindb.analysis.contrasts import contrasts as contrasts_of
 from skindb.analysis.formulas import (
     SUBJECT,
     MixedModel,
@@ -26,6 +29,7 @@ from skindb.analysis.formulas import (
 )
 from skindb.analysis.long_form import COLUMNS as VALUES
 from skindb.analysis.long_form import INTERCEPT, tidy
+from skindb.analysis.quantities import quantities_of
 from skindb.analysis.study import (
     Population,
     Results,
@@ -169,9 +173,43 @@ def linear_model(
         if any(WITHOUT in reason for reason in reasons)
         else "use fewer terms, or add takes",
     )
+    if not model.is_log and CONDITION in used:
+        flags += _even_reflection(cohort, model.quantity, fits)
     compared = "" if CONDITION in used else ", ".join([NORMAL, *doses])
     stated = {"formula": formula, "margin": margin, "condition": compared}
     return _labelled(fits, flags, cohort, stated)
+
+
+def _even_reflection(
+    cohort: Dataset, quantity: str, fits: dict[str, _Fit]
+) -> list[str]:
+    """Widen the intervals of conditions by the error of even reflection, and withhold p
+    values of effects within it, which are named.
+    """
+    flags = []
+    with suppress(InputError):  # of conditions of different subjects, and of delta E
+        for contrast in contrasts_of(
+            cohort, CONDITION, (), partial(quantities_of, names=(quantity,))
+        ):
+            term = f"{CONDITION}[T.{contrast.name.removesuffix(f' less {NORMAL}')}]"
+            for name, error in zip(
+                contrast.quantities.names, np.ravel(contrast.even), strict=True
+            ):
+                if name not in fits or term not in fits[name].table.index:
+                    continue
+                table = fits[name].table
+                estimate = table.loc[term, variables.MODEL_ESTIMATE]
+                for end in COLUMNS[2:4]:
+                    half = table.loc[term, end] - estimate
+                    table.loc[term, end] = estimate + np.copysign(
+                        np.hypot(half, error), half
+                    )
+                if abs(estimate) < error:
+                    table.loc[term, variables.MODEL_P] = np.nan
+                    flags.append(
+                        f"{name}: even reflection may cause the effect of {term}"
+                    )
+    return flags
 
 
 def _flags(model: MixedModel, measured: pd.DataFrame, used: pd.DataFrame) -> list[str]:

@@ -613,3 +613,24 @@ def test_linear_model__reliability_by_hand(error):
     assert (within < 0.5) == (error == 0.0025)
     flag = "no p values where the reliability is below 0.5"
     assert (flag in found.attrs["flags"]) == (within < 0.5)
+
+
+def test_linear_model__of_conditions_contains_even_reflection():
+    """The errors of two priors, 1.96 hypot(0.01, 0.012), and R_d that rises by 0.02."""
+    names = [f"S{i:02d}" for i in range(20)]
+    cohort = planted_tables(
+        names * 2,
+        conditions=["normal"] * 20 + ["lotion"] * 20,
+        albedo=np.repeat([0.0, 0.02], 20),
+    ).assign_coords(
+        take=[*names, *(f"{name}.lotion" for name in names)],
+        fit_even_reflection_error=("take", np.repeat([0.01, 0.012], 20)),
+    )
+    found = linear_model(cohort, formula="R_d ~ condition + (1 | subject)")
+    one = found.sel(quantity="R_d face G", term="condition[T.lotion]")
+    half = one["model_estimate_high"] - one["model_estimate"]
+    expected = np.hypot(1.96 * np.hypot(0.01, 0.012), 2.093 * one["model_error"])
+    np.testing.assert_allclose(half, expected, rtol=1e-3)
+    assert np.isnan(one["model_p"])
+    flag = "R_d face G: even reflection may cause the effect of condition[T.lotion]"
+    assert flag in found.attrs["flags"]
