@@ -150,10 +150,9 @@ def main(
     ]
     planted = xr.concat(true, "take").assign_coords(cohort.coords)
     # restrict the truth to where estimates exist
-    planted = cohort.drop_vars(
-        [name for name in cohort if str(name).endswith("_error")]
-    ).assign(
-        {
+    planted = cohort.assign(
+        {name: 0 * cohort[name] for name in cohort if str(name).endswith("_error")}
+        | {
             name: planted[name].where(np.isfinite(cohort[name]))
             for name in planted
             if name in cohort
