@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -24,6 +25,7 @@ BLUE, ORANGE, GREEN, RED, PURPLE, SKY, YELLOW = (
     "#56b4e9",
     "#f0e442",
 )
+SYMBOLS = {"R_d": "$R_d$", "sigma_tr": r"$\sigma_{tr}$", "mm-1": "mm$^{-1}$"}
 MARKERS = "osD^vP"  # as many as colours
 CYCLE = (BLUE, ORANGE, GREEN, RED, PURPLE, SKY)
 CHANNELS = (RED, GREEN, BLUE)  # of the camera
@@ -40,6 +42,12 @@ def plain_text() -> Iterator[None]:
         yield
 
 
+def typeset(text: str) -> str:
+    """Text with the symbols of quantities as formulas, for artists with `parse_math`."""
+    pattern = rf"\b({'|'.join(SYMBOLS)})\b"
+    return re.sub(pattern, lambda m: SYMBOLS[m[0]], text.replace("$", r"\$"))
+
+
 def new_axes(width: float, height: float) -> Axes:
     """Axes of a new figure of this size [inch]."""
     from matplotlib import pyplot
@@ -53,7 +61,7 @@ def axes_of_rows(names: Sequence[str], ax: Axes | None) -> tuple[Axes, Array]:
     """Axes with a row for each name, by default new ones, and the places (n,) of the rows."""
     ax = ax or new_axes(6.5, 1.2 + 0.22 * len(names))
     places = np.arange(float(len(names)))[::-1]
-    ax.set_yticks(places, names, fontsize=7)
+    ax.set_yticks(places, [*map(typeset, names)], fontsize=7, parse_math=True)
     ax.set_ylim(-0.6, len(names) - 0.4)
     return ax, places
 

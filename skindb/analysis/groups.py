@@ -401,7 +401,8 @@ def plot_group_effects(table: Dataset, *, ax: Axes | None = None) -> Axes:
         )
     adjusted = ", ".join(table.attrs["adjust"])
     held = f", {adjusted} held fixed" if adjusted else ""
-    ax.set_xlabel(f"effect, 95 % CI [{unit}]{held}\nfilled: adjusted p < 0.05")
+    filled = "\nfilled: adjusted p < 0.05" if is_standardised else ""
+    ax.set_xlabel(f"effect, 95 % CI [{unit}]{held}{filled}")
     plots.legend_above(ax)
     return ax
 

@@ -178,7 +178,8 @@ def plot_translucency(table: Dataset, *, ax: Axes | None = None) -> Axes:
             )
     ax.set_xticks(range(len(sites)), sites)
     ax.set_ylim(bottom=0)
-    ax.set_ylabel("mean sigma_tr with 95 % CI [mm-1]")
+    label = plots.typeset("mean sigma_tr with 95 % CI [mm-1]")
+    ax.set_ylabel(label, parse_math=True)
     plots.legend_beside(ax)
     return ax
 
