@@ -48,10 +48,10 @@ from skindb.numerics.inference import (
     permutation_p,
     sign_flip_p,
 )
-from skindb.numerics.statistics import ROUNDING, known_mean
+from skindb.numerics.statistics import ROUNDING
 from skindb.parameters import ContrastParameters
 from skindb.schema.label import FACE
-from skindb.types import Array, Mask, finite_rows
+from skindb.types import Array, finite_rows
 
 # below which a quantity shows errors more than subjects or their changes ("poor" in Koo
 # and Li 2016), and has no p values
@@ -299,6 +299,14 @@ def _paired(
         names = [trait_of(subjects, group_by).partition(":")[2]]
     quantities = measure(cohort)
     plain = quantities.select(np.flatnonzero(conditions == NORMAL))
+    largest = float(np.nan_to_num(level_error(cohort)))
+    known = [
+        cohort[name].values.astype(float)
+        if name in cohort.coords
+        else np.zeros(len(conditions))
+        for name in (LEVEL, EVEN)
+    ]
+    even = Quantities(np.nan_to_num(np.stack(known, axis=1)), quantities.subject)
     pairs = []
     for name in names:
         changed = quantities.select(np.flatnonzero(conditions == name))
@@ -311,8 +319,10 @@ def _paired(
         if errors is not None and normal.errors is not None:
             errors = np.hypot(errors, normal.errors)
         changes = replace(after, values=after.values - normal.values, errors=errors)
-        of_both = np.isin(quantities.subject, both)
-        rows = [of_both & (conditions == word) for word in (NORMAL, name)]
+        levels = [
+            even.select(np.flatnonzero(conditions == word)).of_subjects(both).values
+            for word in (NORMAL, name)
+        ]
         pairs.append(
             Contrast(
                 f"{name} less {NORMAL}",
@@ -320,7 +330,7 @@ def _paired(
                 np.ones(len(both)),
                 np.empty((len(both), 0)),
                 before=normal.values,
-                even=_even_error(cohort, quantities, rows),
+                even=_even_error(quantities, largest, *levels),
             )
         )
     require(
@@ -333,28 +343,24 @@ def _paired(
     return pairs
 
 
-def _even_error(cohort: Dataset, quantities: Quantities, rows: Sequence[Mask]) -> Array:
-    """Half-widths (q,) of the 95 % intervals of what even reflection may add to the
-    differences of takes in two conditions, given by their masks (take,).
+def _even_error(
+    quantities: Quantities, largest: float, first: Array, second: Array
+) -> Array:
+    """Half-widths (q,) of the 95 % intervals of what even reflection may add to the mean
+    difference of two conditions, from its error and value (subject, 2) in both.
 
     Where both have the same prior, its error cancels, and what was subtracted differs by
     a fraction of the change of the highlights, which is known to about itself; highlights
     may lack as much. Errors of different priors are taken as independent.
     """
-    largest = np.nan_to_num(level_error(cohort))
-    error = change = 0.0
-    if largest > 0:
-        levels = np.nan_to_num(cohort[LEVEL].values.astype(float))
-        first, second = (levels[one].max() for one in rows)
-        error = float(np.hypot(first, second)) if first != second else 0.0
-    if EVEN in cohort.coords:
-        values = cohort[EVEN].values.astype(float)
-        first, second = (np.nan_to_num(known_mean(values[one])) for one in rows)
-        change = float(second - first)
-    error = np.hypot(error, change) / max(largest, ROUNDING)
+    both = np.stack([first[:, 0], second[:, 0]])
+    is_same = np.isclose(*both)
+    change = float((second - first)[:, 1].mean())
+    error = np.hypot(np.where(is_same, 0.0, np.hypot(*both)).mean(), change)
     is_surface = np.char.startswith(quantities.names, SURFACE)
     lacking = np.where(is_surface, NORMAL_95 * abs(change), 0.0)
-    return np.asarray(np.hypot(np.multiply(quantities.common, error), lacking))
+    common = np.multiply(quantities.common, error / max(largest, ROUNDING))
+    return np.asarray(np.hypot(common, lacking))
 
 
 @dataclass(frozen=True)

@@ -493,3 +493,21 @@ def test_group_effects__what_has_p_values_does_not_bias_them():
     assert 0.3 < known.size / p.size < 0.7
     # three standard deviations of 500 independent values
     assert (known <= 0.05).mean() == pytest.approx(0.05, abs=0.03)
+
+
+def test_group_effects__one_subject_with_another_prior_is_one_of_all():
+    """Such as one whose makeup counts as normal: of 20, its error counts by a twentieth."""
+    conditions = np.repeat(["normal", "tan"], 20)
+    cohort = planted_tables(_people(20) * 2, conditions=conditions)
+    error = np.full(40, 0.01)
+    plain, other = (
+        _compare(
+            cohort.assign_coords(fit_even_reflection_error=("take", error * factor)),
+            "condition",
+            quantities=["R_d"],
+        ).isel(contrast=0, quantity=0)
+        for factor in (1, np.where(np.arange(40), 1, 1.5))
+    )
+    half, wider = (one["effect_high"] - one["effect"] for one in (plain, other))
+    added = 1.96 * np.hypot(0.01, 0.015) / 20
+    assert wider == pytest.approx(float(np.hypot(half, added)))
