@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 PAGE = "figures.md"
 MAX_FACES = 5  # of figure 11
+SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 PARTS = ("upper", "lower")  # of the face, in figure 5
 MAX_ROWS = 4  # of figure 19
 TRAITS = ("beard_density", "european", "tan", "lotion")  # of figure 19
@@ -282,9 +283,11 @@ def _profiles(source: Source, picture: Path) -> list[str]:
             ax.semilogy(
                 distance[order], line, "o-", color=colour, markersize=3, label=name
             )
-        ax.set_title(site, fontsize=8)
+        ax.set_title(f"{site} (n = {len(distance)} fibres)", fontsize=8)
         ax.set_xlabel("distance [mm]")
-    axes[0, 0].yaxis.set_major_formatter("{x:.0e}")
+    axes[0, 0].yaxis.set_major_formatter(
+        lambda x, _: "10" + f"{np.log10(x):.0f}".translate(SUPERSCRIPT)
+    )
     axes[0, 0].set_ylabel("reflectance [mm⁻²]")
     axes[0, 0].legend(fontsize=7)
     write_plot(axes[0, 0], picture)
@@ -340,14 +343,9 @@ def _components(source: Source, picture: Path) -> list[str]:
 
 
 def _spheres(source: Source, picture: Path) -> list[str]:
-    own = _of_subject(source)
-    takes = own if len(own) > 1 else []
-    space = source.study("surface", group_by="condition", takes=takes)
+    space = source.study("surface", group_by="condition")
     write_plot(plot_group_spheres(space["brdf_space"].to_dataset().load()), picture)
-    return [
-        f"Mean surface BRDFs of {'one subject, as' if takes else 'all subjects; those'} "
-        "in the paper."
-    ]
+    return ["Mean surface BRDFs over subjects; those of the paper are of one."]
 
 
 def _basis_sizes(source: Source, picture: Path) -> list[str]:
