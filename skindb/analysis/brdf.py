@@ -502,7 +502,7 @@ def plot_basis_size(curves: Mapping[str, Dataset], *, ax: Axes | None = None) ->
         ax.fill_between(k, low, high, color=colour, alpha=0.25, linewidth=0)
         label = f"{name} (n = {curve.attrs['surfels']:,} surfels): {size_range(curve)}"
         style: dict[str, Any] = {"color": colour, "marker": marker, "markersize": 5}
-        ax.plot(k, error, label=label, mfc="white", **style)
+        ax.plot(k, error, label=label, mfc="none", **style)
         last = int(curve[variables.SUFFICIENT_SIZE]) or k[-1]
         chosen = (k >= int(curve[variables.SMALLEST_SIZE])) & (k <= last)
         ax.plot(k[chosen], error[chosen], linestyle="none", **style)
