@@ -89,7 +89,8 @@ def test_translucency_table__groups_and_untrusted_sites():
     assert int(table["sigma_tr_count"].sel(group="male", site="neck", channel="R")) == 2
     conditions = translucency_table(tables(models), group_by="condition")
     assert set(map(str, conditions["group"].values)) == {"normal", "lotion"}
-    assert plot_translucency(table).get_ylabel() == "mean sigma_tr with 95 % CI [mm-1]"
+    label = r"mean $\sigma_{tr}$ with 95 % CI [mm$^{-1}$]"
+    assert plot_translucency(table).get_ylabel() == label
 
 
 def test_plot_study__of_albedo_draws_the_groups_that_were_asked_for(tmp_path):
