@@ -275,7 +275,8 @@ def _colour_flag(contrast: Contrast) -> list[str]:
             before = contrast.before[:, columns]
             change = contrast.quantities.values[:, columns]
             mean = float(known_mean(colour_difference(before + change, before)))
-            differences.append(f"{region} {mean:.2g}")
+            if np.isfinite(mean):  # both takes have the region
+                differences.append(f"{region} {mean:.2g}")
     if not differences:
         return []
     return [

@@ -424,14 +424,16 @@ def study(
         derivation = _derivation(db, key, record, requested, population, inputs)
         # the file of a dictionary may change: a study with one is always computed
         if dictionary is not None or derivation.current() is None:
-            version = DataTree.from_dict(record.compute(population, chosen))
-            if population.notes:
-                version.attrs["registration"] = population.notes
             studied = population.cohort["take"].values.tolist()
+            # before the study, during which a subject may be withdrawn
             tables = db.cohort(
                 "tables", takes=studied, release=release, variables=SPACING
             )
-            version.attrs["spacing"] = spacing_notes(tables)
+            spacing = spacing_notes(tables)
+            version = DataTree.from_dict(record.compute(population, chosen))
+            if population.notes:
+                version.attrs["registration"] = population.notes
+            version.attrs["spacing"] = spacing
             derivation.commit(version)
     return db.read(STUDY, key)
 
