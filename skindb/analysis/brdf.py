@@ -70,9 +70,8 @@ TABLE_HEADER = (
 # surfels of all takes together from which the bases are computed: 56 MB of normal
 # equations
 MAX_FACTORED = 2000
-STUDY_SURFELS = (
-    200  # of each take that the study draws; up to MAX_FACTORED of few takes
-)
+# of each take that the study draws; up to MAX_FACTORED of few takes
+STUDY_SURFELS = 200
 
 
 def population_basis(

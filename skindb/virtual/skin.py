@@ -32,9 +32,8 @@ MATERIALS = (
     "polyurethane-foam",
 )
 SHARP = [1, 3]  # of BASES
-BASES = (
-    4  # of one person, as in the paper; six in all conditions, eight in a population
-)
+# of one person, as in the paper; six in all conditions, eight in a population
+BASES = 4
 MIDDLE_AGE = 40.0  # years, at which age has no effect on gloss
 MIX_SPREAD = 0.3  # between people, of the fraction of the second material of a pair
 WAVES = 40  # of `smooth_noise`

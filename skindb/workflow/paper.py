@@ -391,7 +391,7 @@ def _histograms(source: Source, picture: Path) -> list[str]:
     for ax in axes.flat[len(groups) :]:
         ax.set_axis_off()
     axes[0, 0].set_ylabel("fraction of the area")
-    axes[-1, 0].set_xlabel("albedo $R_d$", parse_math=True)
+    axes[-1, 0].set_xlabel(plots.typeset("albedo R_d"), parse_math=True)
     axes[0, 0].legend(fontsize=7)
     figure.tight_layout()
     write_plot(figure, picture)
