@@ -11,11 +11,11 @@ the standard deviation of its errors over takes, beside the one that is stated; 
 the stated 95 % intervals contain the truth, with the errors that takes have in common and
 without these and the bias; the correlation with the truth; the true reliability, 1 less
 the variance of the errors over that of the values, beside the stated one; and how often
-`analyze groups` has p < 0.05 for a factor that is drawn at random. The second table has
-the regions of surface reflectance. The last ones have the differences of groups, their
-truth (the same regression of the true values), and whether their 95 % intervals contain
-it: nearly always, as they also cover the variation between subjects, which the true
-values share.
+`analyze groups` has p < 0.05 for a factor that is drawn at random. The next tables have
+the regions of surface reflectance and of glossiness. The last ones have the differences
+of groups, their truth (the same regression of the true values), and whether their 95 %
+intervals contain it: nearly always, as they also cover the variation between subjects,
+which the true values share.
 """
 
 from __future__ import annotations
@@ -37,9 +37,11 @@ from skindb.analysis.quantities import (
     quantities_of,
 )
 from skindb.analysis.subjects import NORMAL
+from skindb.reflectance.tables import NARROW_ANGLE, directional_albedo
 from skindb.virtual.capture import _materials
 
 NAMES = tuple(QUANTITIES)
+BY_REGION = (SURFACE, "glossiness")
 HEADER = (
     "bias | deviation | stated | covered | without bias | correlation | reliability | "
     "stated |"
@@ -51,11 +53,13 @@ def truth_of(path: Path, cohort: xr.Dataset) -> xr.Dataset:
     held = np.load(path)
     names = held["region_names"].tolist()
     sites = held["site_names"].tolist()
-    surface = held["surface_weights"] @ _materials()[1]
+    materials, albedo = _materials()
+    narrow = directional_albedo(materials.table, 1.0, NARROW_ANGLE)[0]
     # the even part of the materials is diffuse light for every fit
-    even = held["surface_lambertian"]
-    skin = np.column_stack([held["diffuse_reflectance"], surface - even])
-    regions = np.full((cohort.sizes["region"], 4), np.nan)
+    even = np.outer(held["surface_lambertian"], [1.0, np.sin(2 * NARROW_ANGLE) ** 2])
+    surface = held["surface_weights"] @ np.column_stack([albedo, narrow]) - even
+    skin = np.column_stack([held["diffuse_reflectance"], surface])
+    regions = np.full((cohort.sizes["region"], skin.shape[1]), np.nan)
     for i, name in enumerate(cohort["region"].values.tolist()):
         inside = np.full(len(skin), name == "face")
         if name in names:
@@ -70,6 +74,7 @@ def truth_of(path: Path, cohort: xr.Dataset) -> xr.Dataset:
         {
             "region_diffuse_reflectance": (("region", "channel"), regions[:, :3]),
             "region_surface_reflectance": (("region",), regions[:, 3]),
+            "region_glossiness": (("region",), regions[:, 4] / regions[:, 3]),
             "site_sigma_tr": (("site", "channel"), probed),
         }
     )
@@ -166,12 +171,12 @@ def main(
         name = estimated.quantity.name
         everywhere = np.ones(estimated.values.shape[1:], bool)
         print(f"| {name} | {compared(estimated, truth, everywhere)} | {false[name]} |")
-        if name == SURFACE:
-            surface = (estimated, truth)
-    print(f"\n| {SURFACE} | {HEADER}")
-    regions = surface[0].labels[0]
-    for region in regions:
-        print(f"| {region} | {compared(*surface, np.array(regions) == region)} |")
+    for estimated, truth in zip(*both, strict=True):
+        if estimated.quantity.name in BY_REGION:
+            print(f"\n| {estimated.quantity.name} | {HEADER}")
+            regions = np.array(estimated.labels[0])
+            for region in regions:
+                print(f"| {region} | {compared(estimated, truth, regions == region)} |")
     options = {"group_by": group_by, "adjust": adjust, "quantities": NAMES}
     estimated, want = (
         group_effects(part, permutations=1000, rng=np.random.default_rng(0), **options)

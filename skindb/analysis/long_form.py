@@ -60,10 +60,10 @@ def tidy(cohort: Dataset) -> pd.DataFrame:
         it has the name of another column, or is called Intercept. Takes without a white
         target have R_d with the status "relative" and no colours.
 
-        Quantities: R_d, surface reflectance and sigma_tr; CIELAB L*, a*, b*, individual
-        typology angle (ITA), melanin index and erythema index of R_d, see
-        `skindb.analysis.colour`; and delta E, the CIEDE2000 difference to the first
-        take of the subject in the condition normal, which noise makes larger.
+        Quantities: those of `skindb.analysis.quantities.QUANTITIES`, of which colours are
+        derived from R_d, see `skindb.analysis.colour`; and delta E, the CIEDE2000
+        difference to the first take of the subject in the condition normal, which noise
+        makes larger.
 
     Raises
     ------

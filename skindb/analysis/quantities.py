@@ -95,6 +95,15 @@ MEASURED = (
     ),
 )
 
+GLOSSINESS = Quantity(
+    "glossiness",
+    variables.REGION_GLOSSINESS,
+    variables.TEXEL_GLOSSINESS,
+    ("region",),
+    variables.REGION_GLOSSINESS_ERROR,
+    variables.REGION_GLOSSINESS_ERROR,
+)
+
 
 def _of_lab(index: int, reflectance: Array) -> Array:
     return cielab(reflectance)[..., index]
@@ -112,6 +121,7 @@ QUANTITIES = {
     quantity.name: quantity
     for quantity in (
         *MEASURED,
+        GLOSSINESS,
         *(
             replace(REFLECTANCE, name=name, dims=("region",), unit=unit, derive=derive)
             for name, (unit, derive) in DERIVED.items()

@@ -129,28 +129,32 @@ def region_tables(fitted: Dataset, masks: Mapping[str, Mask]) -> Dataset:
         (from independent errors of the surfels) and `_total_error` (including the part
         that all surfels have in common, which averaging does not reduce),
         `region_surface_reflectance` with its error, of the surfels that were seen within
-        12 degrees of their highlight, unless there are none in the take; the error is
-        that of the scatter between patches of the region, which contains differences of
-        its skin, and at least that from independent errors. NaN for a region without
-        such surfels.
+        12 degrees of their highlight, unless there are none in the take, and
+        `region_glossiness` of the same surfels, weighted by the light that they reflect;
+        the errors are those of the scatter between patches of the region, which contains
+        differences of its skin, and at least those from independent errors. NaN for a
+        region without such surfels.
     """
     trusted = trusted_surfels(fitted)
     cell = np.floor(fitted[variables.SURFEL_POSITION].values / PATCH_SIZE)
     patch = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
     area = fitted[variables.SURFEL_AREA].values.astype(float)
     colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(float)
-    noise, total, shine, shine_error = (
+    noise, total, shine, shine_error, sharp, sharp_error = (
         fitted[name].values.astype(float) if name in fitted else np.full(shape, np.nan)
         for name, shape in (
             (variables.DIFFUSE_REFLECTANCE_ERROR, colour.shape),
             (variables.DIFFUSE_REFLECTANCE_TOTAL_ERROR, colour.shape),
             (variables.SURFACE_REFLECTANCE, area.shape),
             (variables.SURFACE_REFLECTANCE_ERROR, area.shape),
+            (variables.GLOSSINESS, area.shape),
+            (variables.GLOSSINESS_ERROR, area.shape),
         )
     )
     if variables.SMALLEST_HALF_ANGLE in fitted:
         near = fitted[variables.SMALLEST_HALF_ANGLE].values <= MAX_HALF_ANGLE
         shine[~near & (trusted & near).any()] = np.nan
+    reflected = np.nan_to_num(area * shine)
     # model errors of neighbouring surfels are correlated: averaging does not reduce them
     model_error = np.sqrt(np.maximum(total**2 - noise**2, 0))
     tables: dict[str, list[Any]] = {}
@@ -159,19 +163,23 @@ def region_tables(fitted: Dataset, masks: Mapping[str, Mask]) -> Dataset:
         weight = area[inside]
         mean, error = _weighted_mean(colour[inside], noise[inside], weight)
         common, _ = _weighted_mean(model_error[inside], model_error[inside], weight)
-        gloss, gloss_error = _weighted_mean(shine[inside], shine_error[inside], weight)
-        scatter = _patch_error(shine[inside] - gloss, weight, patch[inside])
+        gloss, sharpness = (
+            _surface_mean(values[inside], errors[inside], by[inside], patch[inside])
+            for values, errors, by in (
+                (shine, shine_error, area),
+                (sharp, sharp_error, reflected),
+            )
+        )
         for name, value in (
             (variables.REGION_SURFELS, inside.sum()),
             (variables.REGION_AREA, weight.sum()),
             (variables.REGION_DIFFUSE_REFLECTANCE, mean),
             (variables.REGION_DIFFUSE_REFLECTANCE_ERROR, error),
             (variables.REGION_DIFFUSE_REFLECTANCE_TOTAL_ERROR, np.hypot(error, common)),
-            (variables.REGION_SURFACE_REFLECTANCE, gloss),
-            (
-                variables.REGION_SURFACE_REFLECTANCE_ERROR,
-                np.fmax(gloss_error, scatter),
-            ),
+            (variables.REGION_SURFACE_REFLECTANCE, gloss[0]),
+            (variables.REGION_SURFACE_REFLECTANCE_ERROR, gloss[1]),
+            (variables.REGION_GLOSSINESS, sharpness[0]),
+            (variables.REGION_GLOSSINESS_ERROR, sharpness[1]),
         ):
             tables.setdefault(name, []).append(value)
     return dataset(
@@ -193,6 +201,16 @@ def trusted_surfels(fitted: Dataset) -> Mask:
         enough = fitted[variables.FIT_SAMPLES].values >= MIN_SAMPLES_TRUSTED
         good &= enough | ~(good & enough).any()
     return np.asarray(good & finite_rows(fitted[variables.DIFFUSE_REFLECTANCE].values))
+
+
+def _surface_mean(
+    values: Array, errors: Array, weight: Array, patch: Index
+) -> tuple[Array, Array]:
+    """Weighted mean, and its error from independent errors and from the scatter between
+    patches.
+    """
+    mean, error = _weighted_mean(values, errors, weight)
+    return mean, np.fmax(error, _patch_error(values - mean, weight, patch))
 
 
 def _patch_error(residual: Array, weight: Array, patch: Index) -> float:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from skindb.jit import sample_bits
+from skindb.numerics.statistics import ROUNDING
 from skindb.reflectance import _shade_kernels
 from skindb.reflectance._lumitexel_kernels import BINS, JudgedErrors, Options
 from skindb.reflectance.model import (
@@ -97,6 +98,41 @@ def empty_fit(
         outlier=np.full(n, np.nan),
         counts=np.zeros((lights, cameras, bins), np.int64),
     )
+
+
+def gloss_columns(
+    judged: SurfaceFit, reflectance: Array, gradient: Array
+) -> dict[str, Array]:
+    """Surface reflectance and glossiness of n surfels with their standard errors.
+
+    Parameters
+    ----------
+    judged
+        Fit with the covariance of its m parameters.
+    reflectance
+        (2, n) fractions of light along the normal that surfels reflect: all of it, and
+        that in the narrow of two lobes.
+    gradient
+        (2, n or 1, m) derivatives by the parameters.
+    """
+    whole, narrow = reflectance
+    glossiness = narrow / np.where(whole > 0, whole, np.nan)
+    by_whole, by_narrow = gradient
+    by_narrow = by_narrow - glossiness[:, None] * by_whole
+    covariance = np.nan_to_num(judged.covariance)
+    variance = np.stack(
+        [
+            np.einsum("nj,njk,nk->n", slope, covariance, slope)
+            for slope in np.broadcast_arrays(by_whole, by_narrow)
+        ]
+    )
+    deviation = np.sqrt(np.where(variance > ROUNDING**2, variance, np.nan))
+    return {
+        variables.SURFACE_REFLECTANCE: whole,
+        variables.SURFACE_REFLECTANCE_ERROR: deviation[0],
+        variables.GLOSSINESS: glossiness,
+        variables.GLOSSINESS_ERROR: deviation[1] / whole,
+    }
 
 
 def shade_diffuse(points: Points, lamp: Lamp, *, eta: float) -> Float32:

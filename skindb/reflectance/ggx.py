@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, ClassVar
 
 import numpy as np
@@ -28,6 +29,7 @@ from skindb.reflectance._ggx_kernels import (
 from skindb.reflectance.block import (
     FIT_VARIABLES,
     empty_fit,
+    gloss_columns,
     kernel_block,
     kernel_errors,
     kernel_options,
@@ -47,7 +49,7 @@ from skindb.reflectance.model import (
 )
 from skindb.reflectance.reduction import fitted_surfels
 from skindb.reflectance.sampling import tangents
-from skindb.reflectance.tables import Table, tabulate
+from skindb.reflectance.tables import NARROW_ANGLE, Table, tabulate
 from skindb.schema import FitStatus, check, dataset, variables
 from skindb.schema.notes import Omission
 from skindb.types import Array, Float32, float64, lengths
@@ -62,15 +64,20 @@ TABLE_QUANTILES = (0.01, 0.99)
 
 @lru_cache(maxsize=4)
 def _normal_albedo(index: float) -> tuple[Array, Array]:
-    """Roughnesses, and the fraction of light along the normal that their lobes reflect."""
+    """Roughnesses (n,), and the fractions (2, n) of light along the normal that their lobes
+    reflect: all of it, and that within `NARROW_ANGLE`.
+    """
     alpha = np.geomspace(MIN_ROUGHNESS, MAX_ROUGHNESS, ALBEDO_NODES)
-    theta, weight = np.polynomial.legendre.leggauss(400)
-    theta = (theta + 1) * np.pi / 4
-    wi = np.stack([np.sin(theta), 0 * theta, np.cos(theta)], axis=-1)
-    wo = np.broadcast_to([0.0, 0.0, 1.0], wi.shape)
-    value = evaluate_lobe(wi, wo, alpha[:, None], index)
-    ring = weight * np.pi / 4 * 2 * np.pi * np.sin(theta) * np.cos(theta)
-    return alpha, value @ ring
+    node, weight = np.polynomial.legendre.leggauss(400)
+    parts = []
+    for start, end in pairwise([0.0, 2 * NARROW_ANGLE, np.pi / 2]):
+        theta = start + (node + 1) * (end - start) / 2
+        wi = np.stack([np.sin(theta), 0 * theta, np.cos(theta)], axis=-1)
+        wo = np.broadcast_to([0.0, 0.0, 1.0], wi.shape)
+        value = evaluate_lobe(wi, wo, alpha[:, None], index)
+        ring = weight * (end - start) * np.pi * np.sin(theta) * np.cos(theta)
+        parts.append(value @ ring)
+    return alpha, np.stack([parts[0] + parts[1], parts[0]])
 
 
 @dataclass(frozen=True)
@@ -184,22 +191,23 @@ class GGX:
         return dataset(shared)
 
     def judged_columns(self, judged: SurfaceFit) -> dict[str, Array]:
-        """Strength, roughness and the reflectance along the normal with their errors; those
-        are NaN without a lobe.
+        """Strength, roughness, the reflectance along the normal and the glossiness with
+        their errors; those are NaN without a lobe.
         """
         error = np.sqrt(np.diagonal(judged.covariance, axis1=1, axis2=2))
         strength, roughness = judged.parameters.T
         nodes, albedo = _normal_albedo(self.index)
-        slope = np.interp(roughness, nodes, np.gradient(albedo, nodes))
-        gradient = np.stack([self._albedo(roughness), strength * slope], axis=1)
-        variance = np.einsum("nj,njk,nk->n", gradient, judged.covariance, gradient)
+        fraction, slope = (
+            np.stack([np.interp(roughness, nodes, row) for row in rows])
+            for rows in (albedo, np.gradient(albedo, nodes, axis=1))
+        )
+        gradient = np.stack([fraction, strength * slope], axis=-1)
         return {
             variables.LOBE_STRENGTH: strength,
             variables.LOBE_ROUGHNESS: roughness,
             variables.LOBE_STRENGTH_ERROR: error[:, STRENGTH],
             variables.LOBE_ROUGHNESS_ERROR: error[:, ROUGHNESS],
-            variables.SURFACE_REFLECTANCE: self.normal_reflectance(judged.parameters),
-            variables.SURFACE_REFLECTANCE_ERROR: np.sqrt(variance),
+            **gloss_columns(judged, strength * fraction, gradient),
         }
 
     def shade(self, points: Points, lamp: Lamp, *, eta: float) -> Float32:
@@ -224,7 +232,9 @@ class GGX:
 
     def normal_reflectance(self, parameters: Array) -> Array:
         """Fraction (n,) of light along the normal that the lobes reflect."""
-        return np.asarray(parameters[:, STRENGTH] * self._albedo(parameters[:, 1]))
+        nodes, albedo = _normal_albedo(self.index)
+        fraction = np.interp(parameters[:, ROUGHNESS], nodes, albedo[0])
+        return np.asarray(parameters[:, STRENGTH] * fraction)
 
     def simplified(self, parameters: Array) -> tuple[GGX, Array, tuple[Omission, ...]]:
         """The model as it is."""
@@ -250,7 +260,3 @@ class GGX:
         place = np.interp(np.log(roughness), np.log(nodes), np.arange(len(nodes)))
         distance = np.abs(place[:, None] - np.arange(len(nodes)))
         return tables, strength[:, None] * np.maximum(1 - distance, 0.0)
-
-    def _albedo(self, roughness: Array) -> Array:
-        nodes, albedo = _normal_albedo(self.index)
-        return np.asarray(np.interp(roughness, nodes, albedo))

@@ -17,6 +17,7 @@ from skindb.reflectance._block_kernels import Tables, fit_block
 from skindb.reflectance.block import (
     NO_TABLE,
     empty_fit,
+    gloss_columns,
     kernel_block,
     kernel_errors,
     kernel_options,
@@ -39,6 +40,7 @@ from skindb.reflectance.reduction import (
     reduced_dictionary,
 )
 from skindb.reflectance.tables import (
+    NARROW_ANGLE,
     Table,
     TableGrid,
     directional_albedo,
@@ -168,6 +170,11 @@ class Mixture:
         return np.asarray(directional_albedo(self.table, 1.0)[0])
 
     @cached_property
+    def narrow_albedo(self) -> Array:
+        """The part (r,) of `normal_albedo` within `NARROW_ANGLE`."""
+        return np.asarray(directional_albedo(self.table, 1.0, NARROW_ANGLE)[0])
+
+    @cached_property
     def half_width(self) -> Float64:
         """Half width (m,) of the lobe of each BRDF that is mixed, see `half_widths`."""
         table = self.table if self.dictionary is None else self.dictionary.table
@@ -269,20 +276,16 @@ class Mixture:
         return basis
 
     def judged_columns(self, judged: SurfaceFit) -> dict[str, Array]:
-        """Weights, their standard errors, and the reflectance along the normal with its
-        error, which is NaN if no weight is above 0 or weights cannot be distinguished.
+        """Weights, their standard errors, and the reflectance along the normal and the
+        glossiness with their errors, which are NaN if no weight is above 0 or weights
+        cannot be distinguished.
         """
-        albedo = self.normal_albedo
-        covariance = np.nan_to_num(judged.covariance)
-        variance = np.einsum("j,njk,k->n", albedo, covariance, albedo)
+        albedo = np.stack([self.normal_albedo, self.narrow_albedo])[:, None]
         deviation = np.sqrt(np.diagonal(judged.covariance, axis1=1, axis2=2))
         return {
             variables.BASIS_WEIGHT: judged.parameters,
             variables.BASIS_WEIGHT_ERROR: deviation,
-            variables.SURFACE_REFLECTANCE: self.normal_reflectance(judged.parameters),
-            variables.SURFACE_REFLECTANCE_ERROR: np.sqrt(
-                np.where(variance > 0, variance, np.nan)
-            ),
+            **gloss_columns(judged, (albedo * judged.parameters).sum(axis=-1), albedo),
         }
 
     def shade(self, points: Points, lamp: Lamp, *, eta: float) -> Float32:

@@ -207,7 +207,7 @@ class ReflectanceModel(Protocol):
 
     def judged_columns(self, judged: SurfaceFit) -> dict[str, Array]:
         """Variables of the surfels from a fit with errors: parameters, their errors,
-        `surface_reflectance` and `surface_reflectance_error`.
+        and those of `skindb.reflectance.block.gloss_columns`.
         """
 
     def shade(self, points: Points, lamp: Lamp, *, eta: float) -> Float32:

@@ -123,6 +123,16 @@ SURFACE_REFLECTANCE_ERROR = declare(
     "standard error of surface_reflectance, from the same sources as basis_weight_error",
     uses=Use.EXPORTED | Use.SAMPLED,
 )
+GLOSSINESS = declare(
+    "float32 fitted/glossiness(surfel) [1]",
+    "fraction of surface_reflectance at half vectors within 20 degrees of the normal, the "
+    "narrow of two lobes; 0.7 for a GGX lobe of roughness 0.28",
+    uses=Use.MAPPED,
+)
+GLOSSINESS_ERROR = declare(
+    "float32 fitted/glossiness_error(surfel) [1]",
+    "standard error of glossiness, from the same sources; NaN for a single basis BRDF",
+)
 SIGMA_TR = declare(
     "float32 fitted/sigma_tr(surfel, channel) [mm-1]",
     "effective transport coefficient; its inverse is the translucency",
@@ -384,5 +394,13 @@ REGION_SURFACE_REFLECTANCE = declare(
 )
 REGION_SURFACE_REFLECTANCE_ERROR = declare(
     "float64 tables/region_surface_reflectance_error(region) [1]",
+    "standard error of the mean, from its scatter between patches of the region",
+)
+REGION_GLOSSINESS = declare(
+    "float64 tables/region_glossiness(region) [1]",
+    "mean of glossiness over the same surfels, weighted by the light that they reflect",
+)
+REGION_GLOSSINESS_ERROR = declare(
+    "float64 tables/region_glossiness_error(region) [1]",
     "standard error of the mean, from its scatter between patches of the region",
 )

@@ -123,6 +123,10 @@ TEXEL_SURFACE_REFLECTANCE = declare(
     "float32 maps/texel_surface_reflectance(v, u) [1]",
     "fraction of light along the normal that the surface reflects",
 )
+TEXEL_GLOSSINESS = declare(
+    "float32 maps/texel_glossiness(v, u) [1]",
+    "fraction of this light within the narrow of two lobes",
+)
 TEXEL_SIGMA_TR = declare(
     "float32 maps/texel_sigma_tr(v, u, channel) [mm-1]",
     "effective transport coefficient",

@@ -135,6 +135,30 @@ def test_region_tables__surface_error_is_the_scatter_of_means_with_common_errors
     np.testing.assert_allclose(stated, np.std(means, ddof=1), rtol=0.21)
 
 
+def test_region_tables__glossiness_is_the_narrow_part_of_the_reflected_light():
+    """Its error is that of a ratio of sums over patches (Cochran 1977, section 6.3)."""
+    fitted = _fitted()
+    rng = np.random.default_rng(5)
+    shine = fitted["surface_reflectance"].values.astype(float)
+    sharp = rng.uniform(0.3, 0.7, N)
+    sharp[:50] = np.nan  # black surfels
+    shine[:50] = 0
+    fitted["surface_reflectance"][:] = shine
+    table = region_tables(
+        fitted.assign(glossiness=("surfel", sharp)), {"face": np.ones(N, bool)}
+    )
+    light = fitted["surfel_area"].values * shine
+    narrow = np.nan_to_num(light * sharp)
+    ratio = narrow.sum() / light.sum()
+    square = (fitted["surfel_position"].values // PATCH_SIZE).astype(int)
+    patch = square[:, 0] * 4 + square[:, 1]
+    residual = np.bincount(patch, narrow - ratio * light)
+    count = len(residual)
+    error = np.sqrt((residual**2).sum() * count / (count - 1)) / light.sum()
+    assert table["region_glossiness"].item() == pytest.approx(ratio, rel=1e-6)
+    assert table["region_glossiness_error"].item() == pytest.approx(error, rel=1e-4)
+
+
 def test_trusted_surfels__are_fitted_well_conditioned_and_seen_often():
     fitted = _fitted()
     fitted["fit_status"][0] = 4

@@ -21,6 +21,7 @@ from skindb.reflectance.reduction import (
 )
 from skindb.reflectance.separation import surface_lobes
 from skindb.reflectance.tables import (
+    NARROW_ANGLE,
     brdf_metric,
     directional_albedo,
     half_widths,
@@ -223,8 +224,8 @@ def test_refit__every_bases_as_components_is_the_full_fit(planted, small_diction
 
 @pytest.fixture(scope="module")
 def two_lobes(new_skin, plant):
-    """300 surfels with two distinguishable lobes, their weights, and the fraction each
-    reflects along the normal.
+    """300 surfels with two distinguishable lobes, their weights, and the fractions each
+    reflects along the normal: all, and near the mirror direction.
     """
     table, grid = surface_lobes()
     dictionary = Dictionary(
@@ -235,12 +236,11 @@ def two_lobes(new_skin, plant):
         skin, dictionary, np.random.default_rng(2), noise=0.01, scale=0.2
     )
     assert (weight > 0).all()
-    return (
-        lumitexels,
-        _identity_basis(dictionary),
-        weight,
-        directional_albedo(dictionary.table, 1.0)[0],
-    )
+    albedo = [
+        directional_albedo(dictionary.table, 1.0, angle)[0]
+        for angle in (np.pi / 2, NARROW_ANGLE)
+    ]
+    return lumitexels, _identity_basis(dictionary), weight, np.array(albedo)
 
 
 def _share_inside(found, truth, error):
@@ -249,7 +249,7 @@ def _share_inside(found, truth, error):
 
 
 @pytest.mark.parametrize("mode", ["linear", "perceptual"])
-def test_refit__errors_cover_weights_and_surface_reflectance(two_lobes, mode):
+def test_refit__errors_cover_weights_and_gloss(two_lobes, mode):
     """Rationale: R_d and normals are the true ones, only noise is at work. Expected: 95
     % within 1.96 errors.
 
@@ -264,16 +264,18 @@ def test_refit__errors_cover_weights_and_surface_reflectance(two_lobes, mode):
         _share_inside(found["basis_weight"].values[:, k], weight[:, k], error[:, k])
         for k in range(2)
     ]
-    reflected, spread = (
-        found[f"surface_reflectance{end}"].values for end in ("", "_error")
-    )
-    np.testing.assert_allclose(
-        reflected, found["basis_weight"].values @ strength, rtol=1e-5
-    )
-    shares.append(_share_inside(reflected, weight @ strength, spread))
+    whole, narrow = strength @ found["basis_weight"].values.T
+    true_whole, true_narrow = strength @ weight.T
+    for name, values, truth in (
+        ("surface_reflectance", whole, true_whole),
+        ("glossiness", narrow / whole, true_narrow / true_whole),
+    ):
+        np.testing.assert_allclose(found[name], values, rtol=1e-5)
+        spread = found[f"{name}_error"].values
+        shares.append(_share_inside(values, truth, spread))
+        assert np.nanmedian(spread / values) < 0.1  # small enough to be informative
     assert min(shares) > 0.95 - 0.039
     assert max(shares) < 0.95 + 0.039
-    assert np.median(spread / reflected) < 0.1  # small enough to be informative
 
 
 def test_refit__error_of_diffuse_light_reaches_the_weights(two_lobes):

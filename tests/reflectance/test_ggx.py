@@ -11,6 +11,7 @@ from three_surfels import polariser_factors
 
 from skindb.errors import InputError
 from skindb.parameters import FitParameters
+from skindb.reflectance.block import empty_fit
 from skindb.reflectance.ggx import GGX
 from skindb.reflectance.kinds import SURFACES, surface_model, unfitted_model
 from skindb.reflectance.lobes import evaluate_lobe
@@ -24,6 +25,7 @@ from skindb.reflectance.model import (
     Points,
 )
 from skindb.reflectance.sampling import TableSampler
+from skindb.reflectance.tables import NARROW_ANGLE
 from skindb.schema import FitStatus, dataset
 
 INDEX = 1.4
@@ -214,7 +216,12 @@ def test_fit__errors_are_the_scatter_of_repeated_fits():
     )
     judged = model.fit(block, EXACT, judgement)
     columns = model.judged_columns(judged)
-    for name in ("lobe_strength", "lobe_roughness", "surface_reflectance"):
+    for name in (
+        "lobe_strength",
+        "lobe_roughness",
+        "surface_reflectance",
+        "glossiness",
+    ):
         scatter = columns[name].std(ddof=1)
         stated = np.sqrt(np.mean(columns[f"{name}_error"] ** 2))
         # 60 repeats: a standard deviation is known to 9 %
@@ -289,6 +296,27 @@ def test_normal_reflectance__is_the_integral():
         whole = (evaluate_lobe(wi, up, alpha, INDEX) * wi[..., 2] * solid).sum()
         found = GGX(INDEX).normal_reflectance(np.array([[0.7, alpha]]))
         np.testing.assert_allclose(found, 0.7 * whole, rtol=5e-3)
+
+
+def test_judged_columns__glossiness_is_the_integral():
+    """Half vectors within an angle are directions of light within twice of it. One per cent
+    is the error of interpolation between 24 roughnesses and of the cells that the angle
+    cuts. Beside an exact roughness glossiness has no error.
+    """
+    wi, solid = hemisphere()
+    up = np.broadcast_to([0.0, 0.0, 1.0], wi.shape)
+    is_narrow = wi[..., 2] > np.cos(2 * NARROW_ANGLE)
+    alpha = np.array([0.1, 0.28, 0.6])
+    parameters = np.column_stack([[0.5, 1.0, 2.0], alpha])
+    block = planted([0.8] * 3, [0.3] * 3)
+    judged = empty_fit(block, Judgement(np.zeros((3, 3))), 2, parameters)
+    judged.covariance[:] = np.diag([0.01, 0.0])
+    columns = GGX(INDEX).judged_columns(judged)
+    for width, found in zip(alpha, columns["glossiness"], strict=True):
+        light = evaluate_lobe(wi, up, width, INDEX) * wi[..., 2] * solid
+        want = light[is_narrow].sum() / light.sum()
+        np.testing.assert_allclose(found, want, rtol=0.01)
+    assert np.isnan(columns["glossiness_error"]).all()
 
 
 def test_resample__tables_reproduce_the_lobes():
