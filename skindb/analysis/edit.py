@@ -268,9 +268,16 @@ def _moved_texture(
     """Shift the distributions of log albedo and of its bands in the map, and apply the
     change to the surfels.
     """
-    edit = edit_texture(maps, shift, texture, rng=np.random.default_rng(0))
+    uv = registered[variables.COMMON_UV].values
+    edit = edit_texture(
+        maps,
+        shift,
+        texture,
+        surfels=int(finite_rows(uv).sum()),
+        rng=np.random.default_rng(0),
+    )
     colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(float)
-    change = at_surfels(edit.change, registered[variables.COMMON_UV].values)
+    change = at_surfels(edit.change, uv)
     moved, report = _with_albedo(fitted, colour * np.exp(change), albedo)
     # requested change of the mean of the whole face, like the other values of the report
     region = texture["region"].values.tolist().index(FACE)

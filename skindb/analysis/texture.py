@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.random import Generator
 from scipy.ndimage import gaussian_filter
+from scipy.signal import resample
 from xarray import Dataset
 
 from skindb.analysis.regions import map_regions
@@ -18,8 +19,12 @@ from skindb.errors import require
 from skindb.geometry.atlas import bilinear, push_pull
 from skindb.numerics.factorise import principal_axes
 from skindb.numerics.texture import (
+    LEVELS,
+    NOISE,
+    ORIENTATIONS,
     Synthesis,
     image_parts,
+    level_fractions,
     part_members,
     part_names,
     part_quantiles,
@@ -220,6 +225,7 @@ def edit_texture(
     shift: Array,
     texture: Dataset,
     *,
+    surfels: int | None = None,
     iterations: int = ITERATIONS,
     rng: Generator,
 ) -> TextureEdit:
@@ -238,6 +244,9 @@ def edit_texture(
         quantile unchanged.
     texture
         From `texture_statistics`.
+    surfels
+        Number of surfels from which the measured texels were interpolated; default as
+        many as texels. Octaves above the highest frequency that they sample do not change.
     iterations
         See `skindb.numerics.texture.synthesise`.
     rng
@@ -248,18 +257,24 @@ def edit_texture(
     axes = texture[variables.TEXTURE_COLOUR_AXIS].values
     drawn = texture[variables.TEXTURE_REGION].values.astype(np.float32)
     log, measured = log_albedo(maps)
+    size = measured.shape
+    octaves = _unsampled_octaves(measured, surfels)
+    shape = tuple(-(-side // 2**octaves) for side in size)
+    shift = _without_octaves(shift, octaves)
+    quantiles = _without_octaves(texture[variables.TEXTURE_QUANTILE].values, octaves)
     halves = {BEARD, REST} <= set(names) and bool(
         np.isfinite(shift[[names.index(BEARD), names.index(REST)], :, 0]).all()
     )
     if halves:
         matched = [names.index(BEARD), names.index(REST)]
-        beard = gaussian_filter(drawn[matched[0]], BLEND * len(drawn[0]))
+        [beard] = level_fractions(drawn[matched[0]], [shape])
+        beard = gaussian_filter(beard, BLEND * shape[1])
         regions = [beard, 1 - beard]
     else:
         matched = [names.index(FACE)]
-        regions = [np.ones(measured.shape, np.float32)]
-    counted = [drawn[i] * measured for i in matched]
-    images = decorrelated(log, mean, axes)
+        regions = [np.ones(shape, np.float32)]
+    counted = [level_fractions(drawn[i] * measured, [shape])[0] for i in matched]
+    images = _resized(decorrelated(log, mean, axes), shape)
 
     def synthesised(axis: int, result: Generator) -> Synthesis:
         target = shift[matched, axis].astype(float)
@@ -269,6 +284,8 @@ def edit_texture(
             target,
             measured=counted,
             iterations=iterations,
+            levels=LEVELS - octaves,
+            noise=NOISE / 2**octaves,  # as much in every band as in the whole map
             rng=result,
         )
 
@@ -276,15 +293,38 @@ def edit_texture(
         syntheses = list(
             pool.map(synthesised, range(len(images)), rng.spawn(len(images)))
         )
-    moved = [
-        result.image - image for result, image in zip(syntheses, images, strict=True)
-    ]
-    change = np.moveaxis(np.stack(moved), 0, -1) @ np.linalg.inv(axes).T
-    after = [image + step for image, step in zip(images, moved, strict=True)]
+    after = np.stack([result.image for result in syntheses])
+    moved = _resized(after - images, size)
+    change = np.moveaxis(moved, 0, -1) @ np.linalg.inv(axes).T
     distances = _distances(
-        texture, matched, [_quantiles(taken, counted) for taken in (images, after)]
+        quantiles[:, matched],
+        [_quantiles(taken, counted, LEVELS - octaves) for taken in (images, after)],
     )
     return TextureEdit(change, tuple(result.trace for result in syntheses), *distances)
+
+
+def _unsampled_octaves(measured: Mask, surfels: int | None) -> int:
+    """Number of the finest octaves of a map of which its surfels sample no more than half."""
+    if surfels is None:
+        return 0
+    texels = max(measured.sum() / surfels, 1.0)  # of a surfel
+    return min(int(np.log2(texels) / 2), LEVELS - 1)
+
+
+def _without_octaves(values: Array, octaves: int) -> Array:
+    """Values (..., part, level) without those of the finest octaves, and with 0 for the
+    high-pass residual, which then contains these octaves.
+    """
+    finest = range(2, 2 + ORIENTATIONS * octaves)
+    rest = np.delete(values, finest, axis=-2)
+    if octaves:
+        rest[..., 1, :] = 0.0
+    return rest
+
+
+def _resized(images: Array, shape: tuple[int, ...]) -> Array:
+    """Periodic images (n, h, w) in another size, with the frequencies that both have."""
+    return np.asarray(resample(resample(images, shape[0], axis=1), shape[1], axis=2))
 
 
 def at_surfels(change: Array, uv: Array) -> Array:
@@ -295,9 +335,11 @@ def at_surfels(change: Array, uv: Array) -> Array:
     return bilinear(change, np.clip(uv, 0.0, 1.0) * size)
 
 
-def _quantiles(images: Iterable[Array], masks: Iterable[Array]) -> Array:
+def _quantiles(
+    images: Iterable[Array], masks: Iterable[Array], levels: int = LEVELS
+) -> Array:
     """Quantiles (region, axis, part, level) of the images of three axes in regions (v, u)."""
-    parts = [image_parts(np.asarray(image, np.float32)) for image in images]
+    parts = [image_parts(np.asarray(image, np.float32), levels) for image in images]
     inside = [part_members(mask, parts[0]) for mask in masks]
     return np.array(
         [[part_quantiles(axis, index) for axis in parts] for index in inside]
@@ -305,22 +347,20 @@ def _quantiles(images: Iterable[Array], masks: Iterable[Array]) -> Array:
 
 
 def _distances(
-    texture: Dataset, matched: list[int], quantiles: list[Array]
+    of_takes: Array, quantiles: list[Array]
 ) -> tuple[float | None, float | None]:
-    """Distances of the edited and the unedited take from the mean of the takes.
+    """Distances of the edited and the unedited take from the mean of takes with the
+    quantiles (take, region, axis, part, level).
 
     The unit is the standard deviation of the scores on the principal axes of the takes'
     distributions; the distance is the root mean square over the axes, which is about 1
     for takes of the population. None if there are too few takes.
     """
-    quantiles_of_takes = (
-        texture[variables.TEXTURE_QUANTILE].values[:, matched].astype(float)
-    )
-    quantiles_of_takes = quantiles_of_takes.reshape(len(quantiles_of_takes), -1)
+    quantiles_of_takes = of_takes.astype(float).reshape(len(of_takes), -1)
     # takes with all of these regions
     rows = quantiles_of_takes[finite_rows(quantiles_of_takes)]
     after, before = (values.reshape(-1) for values in quantiles[::-1])
-    usable = np.isfinite(before) & np.isfinite(after)
+    usable = np.isfinite(before) & np.isfinite(after) & rows.any(axis=0)
     if len(rows) < MIN_TAKES_DISTANCE or not usable.any():
         return None, None
     principal = principal_axes([*rows[:, usable]], len(rows) - 1)

@@ -36,9 +36,7 @@ MAX_SHAPES = LEVELS + 1  # whose masks are kept: 25 MB for images of 1024 x 1024
 QUANTILES = 256  # entries of a quantile function
 # values; a quantile of this many is accurate to 0.14 % of all ranks, a third of a level
 MAX_SORTED = 1 << 17
-# standard deviation of the noise added before matching, relative to that of the
-# requested change
-NOISE = 0.05
+NOISE = 0.05  # see `synthesise`
 
 
 def build(
@@ -340,6 +338,7 @@ def synthesise(
     iterations: int = 5,
     levels: int = LEVELS,
     orientations: int = ORIENTATIONS,
+    noise: float = NOISE,
     rng: np.random.Generator,
 ) -> Synthesis:
     """Change the distributions of the parts of an image (Heeger and Bergen 1995, section 3).
@@ -366,9 +365,11 @@ def synthesise(
         Number of iterations.
     levels, orientations
         Size of the pyramid.
+    noise
+        Standard deviation of the noise that is added first, so that parts without detail
+        can gain some, relative to that of the requested change.
     rng
-        Random generator of the noise that is added first, so that parts without detail
-        can gain some.
+        Random generator of this noise.
     """
     image = float64(image)
     if not np.nan_to_num(shifts).any():
@@ -376,7 +377,7 @@ def synthesise(
     parts = image_parts(image, levels, orientations)
     matching = _Matching.of(parts, regions, shifts, measured)
     change = float(np.sqrt(np.mean(np.nan_to_num(shifts[:, 0]) ** 2)))
-    image = image + NOISE * change * rng.standard_normal(image.shape)
+    image = image + noise * change * rng.standard_normal(image.shape)
     trace = []
     for _ in range(iterations):
         image = matching.matched(image, 0, matching.quantiles([image])[:, 0])

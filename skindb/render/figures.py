@@ -33,6 +33,7 @@ MARGIN = 0.03  # border around the head, as a fraction of the longer side
 DPI = 90
 RAY_START_MM = 10.0  # in front of the head
 CELL = 2.0  # inches, the longer side of a picture
+GAP = 0.04  # inches between pictures
 GRID_MARGIN_PX = 4  # pixels around the lit part
 
 
@@ -412,11 +413,11 @@ def write_grid(
     gain = auto_exposure(pictures[0]) if exposure is None else exposure
     crop = _lit(pictures)
     height, width = pictures[0][crop].shape[:2]
-    size = (CELL * width / max(height, width), CELL * height / max(height, width))
+    size = np.array([width, height]) * (CELL + GAP) / max(height, width)
     figure, axes = pyplot.subplots(
         len(rows),
         len(titles),
-        figsize=(size[0] * len(titles) + 1.4, size[1] * len(rows) + 0.4),
+        figsize=size * [len(titles), len(rows)],
         squeeze=False,
     )
     for line, (label, row) in zip(axes, rows.items(), strict=True):
@@ -427,7 +428,8 @@ def write_grid(
         line[0].set_ylabel(label, rotation=0, ha="right", va="center", fontsize=8)
     for ax, title in zip(axes[0], titles, strict=True):
         ax.set_title(title, fontsize=8)
-    figure.subplots_adjust(wspace=0.02, hspace=0.02)
+    # labels lie outside, and are included by "tight"
+    figure.subplots_adjust(0, 0, 1, 1, wspace=GAP / CELL, hspace=GAP / CELL)
     figure.savefig(
         private_file(path),
         dpi=max(150.0, max(height, width) / CELL),

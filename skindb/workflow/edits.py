@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from skindb.workflow.derive import Derivation, derive
 from skindb.workflow.fit import dictionary_at
 
 GRID_SIDE = 320.0  # pixels, the longer side of a picture in a grid
+LABEL_WIDTH = 26  # characters
 METHOD = (apply_traits, common_maps)  # functions that compute an edit
 STRENGTHS = (0.5, 1.0)  # of the edits in a grid, as in figure 19 of the paper
 
@@ -120,7 +122,8 @@ def edit_grid(
     progress
         Called with the stage, the number of finished steps and the total number of steps.
     **options
-        Of `skindb.render.rendering.radiance_of`: lights, camera, samples, subsurface, and
+        Of `skindb.render.rendering.radiance_of`: lights, by default the one nearest to
+        the frontal camera, in which gloss shows most; camera, samples, subsurface, and
         scale, by default such that a picture's longer side has 320 pixels.
 
     Returns
@@ -132,6 +135,7 @@ def edit_grid(
     source = editable_model(db, take, study, dictionary)
     db.require_consent(take, "export")
     options.setdefault("scale", _grid_scale(source.model))
+    options.setdefault("lights", [_frontal_light(source.model)])
     plain = radiance_of(source.model, **options)
     pictures = {}
     strongest = {}
@@ -244,7 +248,7 @@ def _grid_scale(model: DataTree) -> float:
 def _sides(edited: DataTree) -> str:
     """How many takes the traits of a row follow from."""
     return "\n".join(
-        note.partition(": ")[2].partition(";")[0]
+        fill(note.partition(": ")[2].partition(";")[0], LABEL_WIDTH)
         for note in edited.attrs["trait_notes"]
     )
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -242,12 +244,15 @@ def radiance(level):
 
 def cells(picture, columns):
     """Brightest value of each column of pictures: labels are black on white, pictures
-    are on black.
+    are on black, and their margins of 4 pixels are all that is between
+    their 20 lit ones.
     """
     lit = (picture[..., :3] < 250).any(axis=2) & (picture[..., :3] > 5).any(axis=2)
     found = np.flatnonzero(lit.sum(axis=0) > 50)  # labels are not that tall
     parts = np.split(found, np.flatnonzero(np.diff(found) > 1) + 1)
     assert len(parts) == columns
+    gaps = [part[0] - before[-1] for before, part in itertools.pairwise(parts)]
+    assert max(gaps) < 0.45 * len(parts[0])
     return [float(np.median(picture[:, part][lit[:, part]])) for part in parts]
 
 
@@ -255,7 +260,7 @@ def test_write_grid__one_exposure_for_all(tmp_path):
     path = tmp_path / "grid.png"
     write_grid(
         path,
-        {"lotion": [radiance(0.5), radiance(0.25), radiance(0.5)]},
+        {row: [radiance(0.5), radiance(0.25), radiance(0.5)] for row in "abcde"},
         ["A", r"$\x$", "full"],
         exposure=1.5,
     )
