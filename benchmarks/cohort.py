@@ -12,15 +12,15 @@ the stated 95 % intervals contain the truth, with the errors that takes have in 
 without these and the bias; the correlation with the truth; the true reliability, 1 less
 the variance of the errors over that of the values, beside the stated one; and how often
 `analyze groups` has p < 0.05 for a factor that is drawn at random. The next tables have
-the regions of surface reflectance and of glossiness. The last ones have the differences
-of groups, their truth (the same regression of the true values), and whether their 95 %
-intervals contain it: nearly always, as they also cover the variation between subjects,
-which the true values share.
+the regions of quantities of the surface. The last ones have the differences of groups,
+their truth (the same regression of the true values), and whether their 95 % intervals
+contain it: nearly always, as they also cover the variation between subjects, which the
+true values share.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -37,11 +37,16 @@ from skindb.analysis.quantities import (
     quantities_of,
 )
 from skindb.analysis.subjects import NORMAL
+from skindb.analysis.summary import region_tables
+from skindb.geometry.mesh import vertex_areas
 from skindb.reflectance.tables import NARROW_ANGLE, directional_albedo
+from skindb.schema import dataset
+from skindb.schema.label import CHANNELS
 from skindb.virtual.capture import _materials
 
 NAMES = tuple(QUANTITIES)
-BY_REGION = (SURFACE, "glossiness")
+BY_REGION = (SURFACE, "glossiness", "albedo contrast", "RMS slope")
+ROUGH = ("region_albedo_contrast", "region_normal_slope")
 HEADER = (
     "bias | deviation | stated | covered | without bias | correlation | reliability | "
     "stated |"
@@ -59,13 +64,19 @@ def truth_of(path: Path, cohort: xr.Dataset) -> xr.Dataset:
     even = np.outer(held["surface_lambertian"], [1.0, np.sin(2 * NARROW_ANGLE) ** 2])
     surface = held["surface_weights"] @ np.column_stack([albedo, narrow]) - even
     skin = np.column_stack([held["diffuse_reflectance"], surface])
-    regions = np.full((cohort.sizes["region"], skin.shape[1]), np.nan)
-    for i, name in enumerate(cohort["region"].values.tolist()):
-        inside = np.full(len(skin), name == "face")
+    label = cohort["region"].values.tolist()
+    member = np.zeros((len(label), len(skin)), bool)
+    for mask, name in zip(member, label, strict=True):
+        mask[:] = name == "face"
         if name in names:
-            inside = held["region_membership"][:, names.index(name)] > 0.5
-        if inside.any():
-            regions[i] = skin[inside].mean(axis=0)
+            mask[:] = held["region_membership"][:, names.index(name)] > 0.5
+    regions = np.array(
+        [
+            skin[mask].mean(axis=0) if mask.any() else 0 * skin[0] + np.nan
+            for mask in member
+        ]
+    )
+    rough = region_tables(true_surface(held), dict(zip(label, member, strict=True)))
     probed = np.full((cohort.sizes["site"], 3), np.nan)
     for i, name in enumerate(cohort["site"].values.tolist()):
         if name in sites:
@@ -77,6 +88,25 @@ def truth_of(path: Path, cohort: xr.Dataset) -> xr.Dataset:
             "region_glossiness": (("region",), regions[:, 4] / regions[:, 3]),
             "site_sigma_tr": (("site", "channel"), probed),
         }
+        | {name: rough[name].drop_vars(rough.coords) for name in ROUGH}
+    )
+
+
+def true_surface(held: Mapping[str, np.ndarray]) -> xr.Dataset:
+    """The vertices of the true surface as surfels without errors."""
+    count = len(held["vertices"])
+    albedo = held["diffuse_reflectance"]
+    return dataset(
+        {
+            "surfel_position": held["vertices"],
+            "surfel_area": vertex_areas(held["vertices"], held["faces"].astype(int)),
+            "shading_normal": held["normals"],
+            "normal_error": np.zeros(count),
+            "diffuse_reflectance": albedo,
+            "diffuse_reflectance_error": 0 * albedo,
+            "fit_status": np.zeros(count),
+        },
+        coords={"channel": CHANNELS},
     )
 
 

@@ -107,7 +107,8 @@ def quantities_option() -> Any:
     """Field of a record for the quantities of a study."""
     text = (
         "Quantities, separated by commas: R_d, surface reflectance, sigma_tr, L*, a*, b*, "
-        "ITA, melanin index, erythema index, glossiness.  [default: the first three]"
+        "ITA, melanin index, erythema index, glossiness, albedo contrast, RMS slope.  "
+        "[default: the first three]"
     )
     return option((), text, metavar="NAME,...", show_default=False)
 

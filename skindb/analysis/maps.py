@@ -121,9 +121,16 @@ def effect_maps(
         min_fraction=MIN_FRACTION,
         rng=rng,
     )
-    parts, flags, faults = _quantity_maps(
-        cohort, chosen_quantities(quantities), size, compare
+    chosen = chosen_quantities(quantities)
+    unmapped = [quantity.name for quantity in chosen if not quantity.mapped]
+    require(
+        not unmapped,
+        f"quantity {', '.join(unmapped)}",
+        "must be known at texels",
+        "one of regions",
+        "compare it with analyze groups",
     )
+    parts, flags, faults = _quantity_maps(cohort, chosen, size, compare)
     if not parts:
         cure = "fit or register more takes"
         nothing = Fault("maps", "some texels must be measured", "none", cure)

@@ -18,16 +18,23 @@ from skindb.analysis.colour import (
     propagated,
     typology_angle,
 )
+from skindb.analysis.roughness import MAX_SPACING
 from skindb.analysis.subjects import LEVEL, level_error
 from skindb.errors import Fault, InputError, require
+from skindb.geometry.mesh import lattice_spacing
 from skindb.numerics.statistics import Moments, known_mean
 from skindb.schema import IDENTIFIED, ProbeStatus, variables
 from skindb.schema.label import CHANNELS
+from skindb.schema.notes import Note, note
 from skindb.types import AnyArray, Array, Index, Mask, float64
 
 NORMAL_95 = 1.96
 RELATIVE = "fit_relative_reflectance"  # coordinate, 1 without a white target
 MIN_SUBJECTS = 3  # for a variance between or within subjects
+# Coarsest over finest spacing of surfels of takes that are studied without a note. Scans of
+# one scanner differ by a few per cent, levels of subdivision by a factor of two.
+MAX_SPACING_RATIO = 1.3
+SPACING = (variables.REGION_AREA, variables.REGION_SURFELS)
 SURFACE = "surface reflectance"
 TYPOLOGY_ANGLE = "ITA"
 COLOUR_DIFFERENCE = "delta E"
@@ -39,7 +46,7 @@ class Quantity:
 
     name: str
     tabulated: str
-    mapped: str
+    mapped: str  # empty for quantities of regions alone
     dims: tuple[str, ...]  # of the table, after the take
     error: str  # variable of the table, without what all takes have in common
     total_error: str  # variable of the table
@@ -103,6 +110,24 @@ GLOSSINESS = Quantity(
     variables.REGION_GLOSSINESS_ERROR,
     variables.REGION_GLOSSINESS_ERROR,
 )
+ROUGHNESS = (
+    Quantity(
+        "albedo contrast",
+        variables.REGION_ALBEDO_CONTRAST,
+        "",
+        ("region", "channel"),
+        variables.REGION_ALBEDO_CONTRAST_ERROR,
+        variables.REGION_ALBEDO_CONTRAST_ERROR,
+    ),
+    Quantity(
+        "RMS slope",
+        variables.REGION_NORMAL_SLOPE,
+        "",
+        ("region",),
+        variables.REGION_NORMAL_SLOPE_ERROR,
+        variables.REGION_NORMAL_SLOPE_ERROR,
+    ),
+)
 
 
 def _of_lab(index: int, reflectance: Array) -> Array:
@@ -122,6 +147,7 @@ QUANTITIES = {
     for quantity in (
         *MEASURED,
         GLOSSINESS,
+        *ROUGHNESS,
         *(
             replace(REFLECTANCE, name=name, dims=("region",), unit=unit, derive=derive)
             for name, (unit, derive) in DERIVED.items()
@@ -221,6 +247,27 @@ def within_deviation(values: Array, subject: Sequence[str]) -> Array:
     return np.asarray(np.where(repeated >= MIN_SUBJECTS, np.sqrt(variance), np.nan))
 
 
+def take_spacing(tables: Dataset) -> Array:
+    """Distance (take,) of neighbouring trusted surfels [mm]; NaN for takes without."""
+    area, count = (tables[name].sum("region").values for name in SPACING)
+    return lattice_spacing(area / np.where(count > 0, count, np.nan))
+
+
+def spacing_notes(tables: Dataset) -> list[Note]:
+    """A note if the spacings of the surfels differ between the takes of a cohort."""
+    spacing = take_spacing(tables)
+    if np.isnan(spacing).all():
+        return []
+    finest, coarsest = np.nanargmin(spacing), np.nanargmax(spacing)
+    if spacing[coarsest] <= MAX_SPACING_RATIO * spacing[finest]:
+        return []
+    low, high = (f"{spacing[i]:.2g} mm" for i in (finest, coarsest))
+    takes = tables["take"].values
+    named = f"{low} apart in {takes[finest]} and {high} in {takes[coarsest]}"
+    cure = f"ingest the takes again with --spacing {spacing[finest]:.2g}"
+    return [note("", f"surfels are {named}: {cure}")]
+
+
 def trusted(takes: Dataset, variable: str) -> DataArray:
     """A variable of probe sites; NaN where the profile does not determine sigma_tr."""
     return takes[variable].where(takes[variables.SITE_STATUS].isin(IDENTIFIED))
@@ -313,6 +360,8 @@ def _measured(
     status = np.where(np.isfinite(values), "fitted", "missing").astype(object)
     if quantity.tabulated == REFLECTANCE.tabulated:
         status[relative] = "relative"
+    if quantity in ROUGHNESS:
+        status[take_spacing(tables) > MAX_SPACING] = "surfels too far apart"
     if is_site:
         words = {int(one): one.name.lower() for one in ProbeStatus}
         codes = tables[variables.SITE_STATUS].transpose(*dims).values
@@ -374,7 +423,9 @@ def quantities_of(cohort: Dataset, names: Sequence[str] = ()) -> Quantities:
         "population",
         f"some take must have {' or '.join(names or DEFAULT)}",
         "none of them",
-        "fit the takes again",
+        f"ingest the takes with a --spacing below {MAX_SPACING:g}"
+        if {quantity.name for quantity in ROUGHNESS} & {*names}
+        else "fit the takes again",
     )
     subject = tuple(map(str, cohort["subject"].values))
     labels, is_log, commons = zip(*described, strict=True)

@@ -3,13 +3,14 @@ sample of surfels.
 """
 
 from collections.abc import Collection, Mapping
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import xarray as xr
 from xarray import Dataset, DataTree
 
 from skindb.analysis.regions import own_masks
+from skindb.analysis.roughness import MIN_AREA, Deviations, band_deviations
 from skindb.errors import InputError, input_error, require
 from skindb.geometry.atlas import atlas_values, push_pull, rasterise_atlas
 from skindb.render.surfels import surfel_texels, texel_codes
@@ -132,60 +133,120 @@ def region_tables(fitted: Dataset, masks: Mapping[str, Mask]) -> Dataset:
         12 degrees of their highlight, unless there are none in the take, and
         `region_glossiness` of the same surfels, weighted by the light that they reflect;
         the errors are those of the scatter between patches of the region, which contains
-        differences of its skin, and at least those from independent errors. NaN for a
-        region without such surfels.
+        differences of its skin, and at least those from independent errors.
+        `region_albedo_contrast` and `region_normal_slope` with such errors: RMS deviations
+        of log R_d and of normals at wavelengths of 10 to 25 mm, without the part that noise
+        causes. NaN for a region without such surfels.
     """
     trusted = trusted_surfels(fitted)
     cell = np.floor(fitted[variables.SURFEL_POSITION].values / PATCH_SIZE)
     patch = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
+    inside = np.array([mask & trusted for mask in masks.values()])
+    tables = (
+        _diffuse_means(fitted, inside)
+        | _surface_means(fitted, inside, patch, trusted)
+        | _roughness(band_deviations(fitted, trusted), inside, patch)
+    )
+    return dataset(tables, coords={"region": list(masks), "channel": CHANNELS})
+
+
+def _diffuse_means(fitted: Dataset, inside: Mask) -> dict[str, AnyArray]:
+    """Variables of the mean R_d of regions, of masks (region, surfel)."""
     area = fitted[variables.SURFEL_AREA].values.astype(float)
     colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(float)
-    noise, total, shine, shine_error, sharp, sharp_error = (
-        fitted[name].values.astype(float) if name in fitted else np.full(shape, np.nan)
-        for name, shape in (
-            (variables.DIFFUSE_REFLECTANCE_ERROR, colour.shape),
-            (variables.DIFFUSE_REFLECTANCE_TOTAL_ERROR, colour.shape),
-            (variables.SURFACE_REFLECTANCE, area.shape),
-            (variables.SURFACE_REFLECTANCE_ERROR, area.shape),
-            (variables.GLOSSINESS, area.shape),
-            (variables.GLOSSINESS_ERROR, area.shape),
+    noise, total = (
+        fitted[name].values.astype(float)
+        if name in fitted
+        else np.full(colour.shape, np.nan)
+        for name in (
+            variables.DIFFUSE_REFLECTANCE_ERROR,
+            variables.DIFFUSE_REFLECTANCE_TOTAL_ERROR,
+        )
+    )
+    # model errors of neighbouring surfels are correlated: averaging does not reduce them
+    model = np.sqrt(np.maximum(total**2 - noise**2, 0))
+    means, errors, common = np.array(
+        [
+            (
+                *_weighted_mean(colour[rows], noise[rows], area[rows]),
+                _weighted_mean(model[rows], model[rows], area[rows])[0],
+            )
+            for rows in inside
+        ]
+    ).swapaxes(0, 1)
+    return {
+        variables.REGION_SURFELS: inside.sum(axis=1),
+        variables.REGION_AREA: inside @ area,
+        variables.REGION_DIFFUSE_REFLECTANCE: means,
+        variables.REGION_DIFFUSE_REFLECTANCE_ERROR: errors,
+        variables.REGION_DIFFUSE_REFLECTANCE_TOTAL_ERROR: np.hypot(errors, common),
+    }
+
+
+def _surface_means(
+    fitted: Dataset, inside: Mask, patch: Index, trusted: Mask
+) -> dict[str, AnyArray]:
+    """Variables of surface reflectance and glossiness of regions."""
+    area = fitted[variables.SURFEL_AREA].values.astype(float)
+    reflectance, reflectance_error, glossiness, glossiness_error = (
+        fitted[name].values.astype(float)
+        if name in fitted
+        else np.full_like(area, np.nan)
+        for name in (
+            variables.SURFACE_REFLECTANCE,
+            variables.SURFACE_REFLECTANCE_ERROR,
+            variables.GLOSSINESS,
+            variables.GLOSSINESS_ERROR,
         )
     )
     if variables.SMALLEST_HALF_ANGLE in fitted:
         near = fitted[variables.SMALLEST_HALF_ANGLE].values <= MAX_HALF_ANGLE
-        shine[~near & (trusted & near).any()] = np.nan
-    reflected = np.nan_to_num(area * shine)
-    # model errors of neighbouring surfels are correlated: averaging does not reduce them
-    model_error = np.sqrt(np.maximum(total**2 - noise**2, 0))
-    tables: dict[str, list[Any]] = {}
-    for mask in masks.values():
-        inside = mask & trusted
-        weight = area[inside]
-        mean, error = _weighted_mean(colour[inside], noise[inside], weight)
-        common, _ = _weighted_mean(model_error[inside], model_error[inside], weight)
-        gloss, sharpness = (
-            _surface_mean(values[inside], errors[inside], by[inside], patch[inside])
-            for values, errors, by in (
-                (shine, shine_error, area),
-                (sharp, sharp_error, reflected),
-            )
+        reflectance[~near & (trusted & near).any()] = np.nan
+    light = np.nan_to_num(area * reflectance)
+    whole, narrow = (
+        np.transpose(
+            [_patch_mean(values[i], errors[i], weight[i], patch[i]) for i in inside]
         )
-        for name, value in (
-            (variables.REGION_SURFELS, inside.sum()),
-            (variables.REGION_AREA, weight.sum()),
-            (variables.REGION_DIFFUSE_REFLECTANCE, mean),
-            (variables.REGION_DIFFUSE_REFLECTANCE_ERROR, error),
-            (variables.REGION_DIFFUSE_REFLECTANCE_TOTAL_ERROR, np.hypot(error, common)),
-            (variables.REGION_SURFACE_REFLECTANCE, gloss[0]),
-            (variables.REGION_SURFACE_REFLECTANCE_ERROR, gloss[1]),
-            (variables.REGION_GLOSSINESS, sharpness[0]),
-            (variables.REGION_GLOSSINESS_ERROR, sharpness[1]),
-        ):
-            tables.setdefault(name, []).append(value)
-    return dataset(
-        {name: np.stack(values) for name, values in tables.items()},
-        coords={"region": list(masks), "channel": CHANNELS},
+        for values, errors, weight in (
+            (reflectance, reflectance_error, area),
+            (glossiness, glossiness_error, light),
+        )
     )
+    return {
+        variables.REGION_SURFACE_REFLECTANCE: whole[0],
+        variables.REGION_SURFACE_REFLECTANCE_ERROR: whole[1],
+        variables.REGION_GLOSSINESS: narrow[0],
+        variables.REGION_GLOSSINESS_ERROR: narrow[1],
+    }
+
+
+def _roughness(
+    deviations: Deviations, inside: Mask, patch: Index
+) -> dict[str, AnyArray]:
+    """Variables of the roughness of regions; NaN for small or bent ones, and where noise
+    explains more than half of the squared deviations.
+    """
+    patch = patch[deviations.surfel]
+    signal = deviations.square - deviations.noise
+    none = np.full(signal.shape, np.nan)
+    roughness = np.full((2, len(inside), 4), np.nan)
+    for region, rows in enumerate(inside[:, deviations.surfel]):
+        weight = deviations.area[rows]
+        noise, _ = _weighted_mean(deviations.noise[rows], none[rows], weight)
+        for k in range(4):
+            mean, error = _patch_mean(
+                signal[rows, k], none[rows, k], weight, patch[rows]
+            )
+            if mean > noise[k] and weight.sum() >= MIN_AREA:
+                root = np.sqrt(mean)
+                roughness[:, region, k] = root, error / (2 * root)
+    values, errors = roughness
+    return {
+        variables.REGION_ALBEDO_CONTRAST: values[:, :3],
+        variables.REGION_ALBEDO_CONTRAST_ERROR: errors[:, :3],
+        variables.REGION_NORMAL_SLOPE: values[:, 3],
+        variables.REGION_NORMAL_SLOPE_ERROR: errors[:, 3],
+    }
 
 
 def trusted_surfels(fitted: Dataset) -> Mask:
@@ -203,7 +264,7 @@ def trusted_surfels(fitted: Dataset) -> Mask:
     return np.asarray(good & finite_rows(fitted[variables.DIFFUSE_REFLECTANCE].values))
 
 
-def _surface_mean(
+def _patch_mean(
     values: Array, errors: Array, weight: Array, patch: Index
 ) -> tuple[Array, Array]:
     """Weighted mean, and its error from independent errors and from the scatter between

@@ -283,6 +283,7 @@ def _report(
             ("out of date", "outdated"),
             ("registration", "registration"),
             ("spacing", "spacing"),
+            ("as normal", "as_normal"),
         )
         for line in skindb.schema.note_lines(attrs.get(name, []))
     ]
@@ -333,7 +334,8 @@ def tidy(db: str, takes: tuple[str, ...], release: str | None, out: Path) -> Non
     condition, visit and repeat, and the attributes of the captures.
     """
     writable(out, ".csv", ".parquet")
-    table, skipped = workflow.tidy_table(existing(db), takes=takes, release=release)
+    database = existing(db)
+    table, *notes = workflow.tidy_table(database, takes=takes, release=release)
     if out.suffix == ".csv":
         text = csv_text([*table], table.values.tolist())
         private_file(out).write_text(text, encoding="utf-8")
@@ -345,6 +347,11 @@ def tidy(db: str, takes: tuple[str, ...], release: str | None, out: Path) -> Non
                 str(out), "needs pyarrow", "none", "pip install pyarrow, or write .csv"
             ) from None
         private_file(out).write_bytes(data)
-    lines = [f"skipped: {line}" for line in skindb.schema.note_lines(skipped)]
-    report = {"path": str(out), "rows": len(table), "skipped": skipped}
+    labelled = dict(zip(("skipped", "spacing"), notes, strict=True))
+    lines = [
+        f"{label}: {line}"
+        for label, said in labelled.items()
+        for line in skindb.schema.note_lines(said)
+    ]
+    report = {"path": str(out), "rows": len(table), **labelled}
     emit(report, [f"{out}: {len(table)} rows", *lines])

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -193,6 +193,11 @@ def vertex_normals(vertices: Array, faces: Faces) -> Float64:
     length = lengths(total)[..., None]
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(length > 0, total / length, np.nan)
+
+
+def lattice_spacing(area: ArrayLike) -> Array:
+    """Distance [mm] of neighbours in even triangular lattices with `area` mm2 per point."""
+    return np.sqrt(2 / np.sqrt(3) * float64(area))
 
 
 def vertex_areas(vertices: Array, faces: Faces) -> Float64:

@@ -25,6 +25,7 @@ from skindb.geometry.clean import CleanMesh
 from skindb.geometry.mesh import (
     carry_points,
     closest_on_mesh,
+    lattice_spacing,
     morton_order,
     subdivide,
     vertex_areas,
@@ -76,12 +77,7 @@ class SurfelSet:
 
     def spacing(self) -> float:
         """Distance [mm] of neighbours in an even lattice of the same density."""
-        return lattice_spacing(float(self.area.mean()))
-
-
-def lattice_spacing(area: float) -> float:
-    """Distance [mm] of neighbours in an even triangular lattice with `area` mm2 per point."""
-    return float(np.sqrt(2 / np.sqrt(3) * area))
+        return float(lattice_spacing(self.area.mean()))
 
 
 def build_surfels(
@@ -136,7 +132,7 @@ def subdivision_levels(mesh: CleanMesh, spacing_mm: float) -> int:
         raise ValueError(f"spacing_mm must be positive, not {spacing_mm}")
     count = len(mesh.vertices)
     area = float(vertex_areas(mesh.vertices, mesh.faces).sum())
-    spacing = lattice_spacing(area / count)
+    spacing = float(lattice_spacing(area / count))
     levels = max(int(np.rint(np.log2(spacing / spacing_mm))), 0)
     rule = f"a capture must have at most {MAX_SURFELS:,} surfels"
     require(

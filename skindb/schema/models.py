@@ -404,3 +404,20 @@ REGION_GLOSSINESS_ERROR = declare(
     "float64 tables/region_glossiness_error(region) [1]",
     "standard error of the mean, from its scatter between patches of the region",
 )
+REGION_ALBEDO_CONTRAST = declare(
+    "float64 tables/region_albedo_contrast(region, channel) [1]",
+    "RMS deviation of log R_d at wavelengths of 10 to 25 mm, without noise",
+)
+REGION_ALBEDO_CONTRAST_ERROR = declare(
+    "float64 tables/region_albedo_contrast_error(region, channel) [1]",
+    "standard error of the contrast, from its scatter between patches of the region",
+)
+REGION_NORMAL_SLOPE = declare(
+    "float64 tables/region_normal_slope(region) [1]",
+    "RMS slope of the normals against smooth ones at wavelengths of 10 to 25 mm, without "
+    "noise",
+)
+REGION_NORMAL_SLOPE_ERROR = declare(
+    "float64 tables/region_normal_slope_error(region) [1]",
+    "standard error of the slope, from its scatter between patches of the region",
+)

@@ -19,6 +19,7 @@ from dask.delayed import Delayed, delayed
 from xarray import Dataset, DataTree
 
 from skindb.analysis.long_form import tidy
+from skindb.analysis.quantities import SPACING, spacing_notes
 from skindb.analysis.regions import common_landmarks
 from skindb.analysis.registration import describe_registration
 from skindb.analysis.studies import STUDIES
@@ -32,7 +33,6 @@ from skindb.analysis.subjects import (
 from skindb.errors import InputError, input_error, require
 from skindb.files import Attributes
 from skindb.format.dome import EXPOSURE_RATIO
-from skindb.ingest.surfels import lattice_spacing
 from skindb.parameters import option_of, require_limits
 from skindb.reflectance.brdf_files import read_dictionary
 from skindb.reflectance.dictionary import convolve_disc, embedded_dictionary
@@ -54,10 +54,6 @@ from skindb.workflow.cohorts import (
 )
 from skindb.workflow.derive import Derivation
 
-# Coarsest over finest spacing of surfels of takes that are studied without a note. Scans of
-# one scanner differ by a few per cent, levels of subdivision by a factor of two.
-MAX_SPACING_RATIO = 1.3
-SPACING = (variables.REGION_AREA, variables.REGION_SURFELS)
 STUDY_NAME = r"[A-Za-z0-9_-]{1,64}"
 
 
@@ -177,9 +173,10 @@ def _opened(
     condition, subject = (cohort[name].values for name in (CONDITION, "subject"))
     has_normal = np.isin(subject, subject[condition == NORMAL])
     counts = np.isin(condition, list(as_normal)) & ~has_normal
+    counted = [note(take, "counts") for take in cohort["take"].values[counts].tolist()]
     return cohort.assign_coords(
         {CONDITION: ("take", np.where(counts, NORMAL, condition))}
-    )
+    ).assign_attrs(as_normal=counted)
 
 
 def _require_models(db: Database, takes: Sequence[str], release: str | None) -> None:
@@ -187,26 +184,6 @@ def _require_models(db: Database, takes: Sequence[str], release: str | None) -> 
     models = db.takes("model", release=release)
     require_fitted(db, models)
     summarise(db, [take for take in takes or models if take in models], release=release)
-
-
-def spacing_notes(tables: Dataset) -> list[Note]:
-    """A note if the spacings of the surfels differ between the takes of a cohort."""
-    area, count = (tables[name].sum("region").values for name in SPACING)
-    # NaN for takes without fitted surfels
-    spacing = [
-        lattice_spacing(a / n) if n else np.nan
-        for a, n in zip(area, count, strict=True)
-    ]
-    if np.isnan(spacing).all():
-        return []
-    finest, coarsest = np.nanargmin(spacing), np.nanargmax(spacing)
-    if spacing[coarsest] <= MAX_SPACING_RATIO * spacing[finest]:
-        return []
-    low, high = (f"{spacing[i]:.2g} mm" for i in (finest, coarsest))
-    takes = tables["take"].values
-    named = f"{low} apart in {takes[finest]} and {high} in {takes[coarsest]}"
-    cure = f"ingest the takes again with --spacing {spacing[finest]:.2g}"
-    return [note("", f"surfels are {named}: {cure}")]
 
 
 def _require_one_scale(db: Database, study: Study, inputs: Sequence[Record]) -> None:
@@ -434,15 +411,16 @@ def study(
             if population.notes:
                 version.attrs["registration"] = population.notes
             version.attrs["spacing"] = spacing
+            version.attrs["as_normal"] = population.cohort.attrs.get("as_normal", [])
             derivation.commit(version)
     return db.read(STUDY, key)
 
 
 def tidy_table(
     db: Database, *, takes: Sequence[str] = (), release: str | None = None
-) -> tuple[pd.DataFrame, list[Note]]:
-    """The table `skindb.analysis.tidy` of the takes of a database, and one note for each
-    skipped take.
+) -> tuple[pd.DataFrame, list[Note], list[Note]]:
+    """The table `skindb.analysis.tidy` of the takes of a database, one note for each
+    skipped take, and one if the spacings of their surfels differ.
 
     Parameters
     ----------
@@ -456,7 +434,7 @@ def tidy_table(
     with logged_action(db, "tidy", takes or db.takes("model", release=release)):
         _require_models(db, takes, release)
         cohort = db.cohort("tables", takes=takes or None, release=release)
-        return tidy(cohort), cohort.attrs["skipped"]
+        return tidy(cohort), cohort.attrs["skipped"], spacing_notes(cohort)
 
 
 def study_key(record: Study, requested: Attributes, name: str | None) -> str:

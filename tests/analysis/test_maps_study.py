@@ -182,6 +182,8 @@ def test_effect_maps__conditions_within_subjects_and_numbers():
 def test_effect_maps__refuses_what_cannot_be():
     with pytest.raises(InputError, match="must divide the 32 texels"):
         maps_of(cohort(8), size=24)
+    with pytest.raises(InputError, match="slope: must be known at texels"):
+        maps_of(cohort(8), quantities=["R_d", "RMS slope"])
     with pytest.raises(InputError, match="two groups"):
         maps_of(cohort(8).isel(take=slice(0, None, 2)))
 

@@ -179,6 +179,24 @@ def test_measurements__what_is_unknown(cohort):
         measurements(cohort, ["ITE"])
 
 
+def test_tidy__roughness_of_surfels_too_far_apart_is_unknown(cohort):
+    """Texture of a take of wide spacing is missing, and says why."""
+    along = ("take", "region")
+    slope = np.array([[0.1, 0.1]] * 3 + [[np.nan, np.nan]])
+    area = np.full((4, 2), 100.0)
+    frame = tidy(
+        cohort.assign(
+            region_normal_slope=(along, slope),
+            region_area=(along, area),
+            region_surfels=(along, np.array([[50] * 2] * 3 + [[10] * 2])),
+        )
+    )
+    rows = face(frame, "RMS slope")
+    far = "surfels too far apart"
+    assert rows["status"].tolist() == ["fitted", "fitted", "fitted", far]
+    assert rows["value"].notna().tolist() == [True, True, True, False]
+
+
 def test_group_effects__of_colour():
     """Planted 0.05 in R_d of the second group: its ITA, by colour-science, is between
     the ends of its interval, and no other quantity is compared.

@@ -3,9 +3,9 @@
 import numpy as np
 import xarray as xr
 
-from skindb.ingest.surfels import lattice_spacing
+from skindb.analysis.quantities import spacing_notes
+from skindb.geometry.mesh import lattice_spacing
 from skindb.schema.notes import note
-from skindb.workflow.studies import spacing_notes
 
 
 def _tables(spacings):

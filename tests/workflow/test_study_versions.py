@@ -9,6 +9,7 @@ from planted_population import TABLES, population
 
 from skindb import workflow
 from skindb.errors import InputError
+from skindb.schema.notes import note
 from skindb.store import Database
 from skindb.workflow import studies
 from skindb.workflow.upkeep import repeat_study
@@ -107,6 +108,8 @@ def test_subjects_without_a_normal_take_are_skipped_unless_their_condition_is_ch
     ]
     assert counts == [2, 3]
     assert not chosen.attrs["skipped"]
+    assert chosen.attrs["as_normal"] == [note("A.lotion", "counts")]
+    assert usual.attrs["as_normal"] == []
     # a subject with a normal take is not affected
     assert workflow.translucency(db, as_normal=["lotion"]).attrs["skipped"] == []
     again = repeat_study(db, chosen.attrs["study"], chosen.attrs["parameters"])
