@@ -121,17 +121,16 @@ def simulate(
             "no --cohort",
             "give the number of subjects",
         )
-    people = (
-        workflow.begin_cohort(
-            out, cohort, conditions, parameters, visits=visits, paper=paper
-        )
-        if cohort or paper
-        else None
+    call, numbers = workflow.begin_simulation(
+        out,
+        parameters,
+        takes=takes,
+        cohort=cohort,
+        conditions=conditions,
+        visits=visits,
+        paper=paper,
+        progress=progress,
     )
-    call = partial(
-        workflow.simulate_one, out, parameters, people=people, progress=progress
-    )
-    numbers = range(takes if people is None else len(people))
     results, faults = each_take(call, numbers, progress=progress, finish=_simulated)
     emit([results[name] for name in sorted(results)], [], faults)
 

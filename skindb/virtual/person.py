@@ -16,7 +16,8 @@ from skindb.virtual.face import FaceShape
 # temperature and exertion of the day
 VISIT_MELANIN = 0.1
 VISIT_BLOOD = 0.4
-PAPER_CONDITIONS = CONDITIONS[:7]  # of dataset A
+# of dataset A
+PAPER_CONDITIONS = ("normal", "lotion", "powder", "sweat", "hot", "cold", "makeup")
 ANCESTRIES = ("european", "east_asian", "african", "south_asian")
 
 

@@ -51,7 +51,7 @@ from .pictures import (
 from .quicklook import quick
 from .rig import calibrate_rig, describe_rig
 from .session import capture_session, plan_session
-from .simulation import begin_cohort, simulate, simulate_one
+from .simulation import begin_simulation, simulate
 from .studies import STUDY_FUNCTIONS, study, tidy_table
 from .takes import (
     Outcome,
@@ -73,7 +73,7 @@ __all__ = [
     "backup",
     "backup_states",
     "basis_grid",
-    "begin_cohort",
+    "begin_simulation",
     "calibrate",
     "calibrate_rig",
     "capture_session",
@@ -115,7 +115,6 @@ __all__ = [
     "results_of",
     "show_take",
     "simulate",
-    "simulate_one",
     "stale_results",
     "study",
     "summarise",

@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -71,35 +71,48 @@ def simulate(
     InputError
         If the folder holds a cohort that was made with other options.
     """
-    parameters = SimulationParameters(**options)
-    people = (
-        begin_cohort(
-            Path(out), cohort, conditions, parameters, visits=visits, paper=paper
-        )
-        if cohort is not None or paper
-        else None
+    call, numbers = begin_simulation(
+        Path(out),
+        SimulationParameters(**options),
+        takes=takes,
+        cohort=cohort,
+        conditions=conditions,
+        visits=visits,
+        paper=paper,
+        progress=progress,
     )
-    call = partial(
-        simulate_one, Path(out), parameters, people=people, progress=progress
-    )
-    folders = dict(
-        results_of(
-            map_takes(
-                call, range(takes if people is None else len(people)), workers=workers
-            )
-        )
-    )
+    folders = dict(results_of(map_takes(call, numbers, workers=workers)))
     return [folders[number] for number in sorted(folders)]
 
 
-def begin_cohort(
+def begin_simulation(
     out: Path,
-    subjects: int | None,
-    conditions: Sequence[str],
     parameters: SimulationParameters,
     *,
-    visits: int = 1,
-    paper: bool = False,
+    takes: int,
+    cohort: int | None,
+    progress: Progress,
+    **of_cohort: Any,
+) -> tuple[Callable[[int], tuple[int, Path]], range]:
+    """The function that simulates a take by its number, and the numbers; arguments as of
+    `simulate`.
+    """
+    people = None
+    if cohort is not None or of_cohort["paper"]:
+        people = _begin_cohort(out, cohort, parameters, **of_cohort)
+        takes = len(people)
+    call = partial(simulate_one, out, parameters, people=people, progress=progress)
+    return call, range(takes)
+
+
+def _begin_cohort(
+    out: Path,
+    subjects: int | None,
+    parameters: SimulationParameters,
+    *,
+    conditions: Sequence[str],
+    visits: int,
+    paper: bool,
 ) -> list[Person]:
     """The people of a cohort, whose parameters are noted in its folder, or compared
     with those that are noted there.
