@@ -17,7 +17,13 @@ from skindb.files import Json, make_private
 from skindb.parameters import ComparisonParameters, ExportParameters
 from skindb.render.figures import write_field, write_grid
 from skindb.render.photographs import Comparison, compare_photographs
-from skindb.render.rendering import chosen_camera, render, render_picture
+from skindb.render.rendering import (
+    chosen_camera,
+    fixed_exposure,
+    render_inputs,
+    render_picture,
+    sum_over_lights,
+)
 from skindb.render.scene import Camera, Environment, Lights
 from skindb.schema import variables
 from skindb.store import Database, intact_or_none, require_fresh
@@ -39,8 +45,10 @@ from skindb.workflow.edits import editable_model
 
 SIDE_PX = 320  # of a picture
 CLOSE_MM = 40.0  # side of a close-up
-# from the front to the subject's left: the shadow of the nose is on the cheek
-LIGHT_DEGREES = 65.0
+# from the front to the subject's left, and the rise over the distance along it: the shadow
+# of the nose is on the cheek, which is lit around it
+LIGHT_DEGREES = 42.0
+LIGHT_RISE = 0.4
 LIGHT_MM = 800.0  # from the nose
 # of the diffusion length, between the points that receive light in a close-up
 SPACING = 1 / 3
@@ -201,11 +209,11 @@ def translucency_grid(
     out: Path,
     *,
     site: str = "cheek",
-    samples: int = 16,
+    samples: int = 2,
     progress: Progress = silent,
 ) -> dict[str, float]:
     """Draw the takes with the shortest and the longest diffusion length at a site, with
-    one light and one exposure.
+    one light and the exposure "fixed" of `render_picture`.
 
     The columns are close-ups of the edge of the nose's shadow with light under the skin,
     and with light that is reflected where it enters.
@@ -219,9 +227,9 @@ def translucency_grid(
     site
         Of the probe.
     samples
-        Rays per pixel.
+        Rays per pixel and axis.
     progress
-        Called with the stage, the number of finished pictures and the total number of pictures.
+        Called with the stage, the number of finished takes and the total number of takes.
 
     Returns
     -------
@@ -247,20 +255,30 @@ def translucency_grid(
         progress("render", i, 2)
         take = extreme(lengths, key=lengths.__getitem__)
         model = db.read("model", take)
-        options: Json = {
-            "camera": _close_up(model),
-            "lights": _light(model),
-            "samples": samples,
-            "spacing": SPACING * lengths[take],
-        }
-        pictures = [
-            render(model, subsurface=under, **options) for under in (True, False)
+        light = _light(model)
+        inputs = render_inputs(
+            model,
+            light,
+            None,
+            _close_up(model),
+            subsurface=True,
+            scale=1.0,
+            spacing=SPACING * lengths[take],
+        )
+        rows[f"{take}\n{lengths[take]:.2f} mm"] = [
+            sum_over_lights(
+                inputs.plan.surface,
+                light,
+                inputs.camera,
+                samples=samples,
+                subsurface=under,
+            )
+            for under in (True, False)
         ]
-        title = f"{take}\n{lengths[take]:.2f} mm"
-        rows[title] = [picture["radiance"].values for picture in pictures]
         chosen[take] = lengths[take]
     progress("render", 2, 2)
-    write_grid(out, rows, ["light under the skin", "without"])
+    gain = fixed_exposure(inputs.given, inputs.camera)
+    write_grid(out, rows, ["light under the skin", "without"], exposure=gain)
     return chosen
 
 
@@ -268,10 +286,10 @@ def _diffusion_lengths(db: Database, site: str) -> dict[str, float]:
     """Mean diffusion length [mm] at a site of every take whose subject consents to exports."""
     lengths = {}
     for take in db.takes("model"):
-        model = db.read("model", take)
-        if "export" not in db.consent(take) or "translucency" not in model.children:
+        record = db.record("model", take)
+        if "export" not in db.consent(take) or "translucency" not in record.contents:
             continue
-        sites = model["translucency"].to_dataset()
+        sites = db.version(record, ["translucency"])["translucency"].to_dataset()
         if site in sites["site"].values.tolist():
             sigma = sites[variables.SITE_SIGMA_TR].sel(site=site).values.astype(float)
             if (np.isfinite(sigma) & (sigma > 0)).all():
@@ -291,9 +309,9 @@ def _nose(model: DataTree) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 def _light(model: DataTree) -> Lights:
-    """A small light to the subject's left."""
+    """A small light to the subject's left, above the nose."""
     turn = np.radians(LIGHT_DEGREES)
-    towards = np.array([np.sin(turn), 0.15, np.cos(turn)])
+    towards = np.array([np.sin(turn), LIGHT_RISE, np.cos(turn)])
     towards /= np.linalg.norm(towards)
     power = np.median(
         model["dome"].to_dataset()[variables.LIGHT_INTENSITY].values, axis=0
@@ -311,7 +329,7 @@ def _close_up(model: DataTree) -> Camera:
     """A camera that looks at the edge of the nose's shadow from the front."""
     frontal, _ = chosen_camera(model["dome"].to_dataset().load(), None)
     # beside the nose, on the side away from the light
-    place = _nose(model) + np.array([-14.0, -2.0, -14.0])
+    place = _nose(model) + np.array([-17.0, -2.0, -14.0])
     seen = frontal.R @ place + frontal.t
     pixel = (frontal.K @ seen)[:2] / seen[2]
     zoom = SIDE_PX / (CLOSE_MM * frontal.K[0, 0] / seen[2])

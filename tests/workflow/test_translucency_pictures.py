@@ -66,13 +66,13 @@ def test_translucency_grid__shows_the_extremes(db, tmp_path, monkeypatch):
     drawn = {}
     write = pictures.write_grid
 
-    def keep(out, rows, names):
+    def keep(out, rows, names, **options):
         drawn.update(rows)
-        write(out, rows, names)
+        write(out, rows, names, **options)
 
     monkeypatch.setattr(pictures, "write_grid", keep)
     monkeypatch.setattr(pictures, "SIDE_PX", 112)
-    found = translucency_grid(db, tmp_path / "grid.png", samples=16)
+    found = translucency_grid(db, tmp_path / "grid.png")
     assert [*found] == ["A", "B"]
     np.testing.assert_allclose([*found.values()], [0.7, 2.0])
     assert read_png(tmp_path / "grid.png").std() > 0.05
