@@ -1,9 +1,11 @@
-"""Cameras that write files, and the assignment of their frames to triggers."""
+"""Cameras that write files, and the order in which their frames were taken."""
 
 import os
+import re
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Protocol
 
@@ -12,19 +14,17 @@ import numpy as np
 from skindb.clock import SYSTEM_CLOCK, Clock
 from skindb.errors import InputError, input_error, system_fault
 from skindb.format.frames import frame_size
-from skindb.types import Float64, Index
 
 FRAME_SUFFIXES = (".png", ".tif", ".tiff", ".exr")
 LOOK_SECONDS = 0.05  # interval at which the folders are polled
-# fraction of the reach: two assignments whose mean errors differ by less are ambiguous
-AMBIGUOUS = 0.2
-# number of frames tried with every trigger to find the offset of the clocks
-CANDIDATES = 3
-PRECISE = 0.2  # fraction of the reach within which times are precise
-# of the frames, with which precise times overrule their number
-MIN_PRECISE_FRACTION = 0.8
-MIN_PRECISE_FRAMES = 8
-QUIET_SECONDS = 2.0  # without a new file, after which no more are expected
+# without a new file of a camera, after which no more are expected of it
+QUIET_SECONDS = 15.0
+# fraction of the names with steps of one, of numbers that a camera counts
+MIN_COUNTED = 0.9
+# between the arrivals of two files, in which their order is certain
+MIN_ARRIVAL_SECONDS = 0.02
+# fraction of files whose names contradict their arrival, above which names tell nothing
+MAX_CONTRADICTED = 0.25
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Shot:
     """A complete image file of a camera."""
 
     path: Path
-    time: float  # s, modification time of the file
+    is_doubtful: bool = False  # whether it may have been taken before its predecessor
 
 
 class Cameras(Protocol):
@@ -52,11 +52,10 @@ class Cameras(Protocol):
         it.
         """
 
-    def collect(self, expected: int, seconds: float) -> Mapping[str, list[Shot]]:
+    def collect(self, expected: int) -> Mapping[str, list[Shot]]:
         """Return the frames of every camera since `start`, in the order in which they were taken.
 
-        Returns when every camera has delivered the expected number, or after the given
-        number of seconds.
+        Returns when every camera has delivered the expected number, or delivers no more.
         """
 
 
@@ -70,7 +69,7 @@ class FolderCameras:
     ids
         Names of the cameras, which are also the names of the subfolders.
     quiet
-        Seconds without a new file after which no more are expected.
+        Seconds without a new file of a camera after which no more are expected of it.
     clock
         Clock by which the folders are watched.
 
@@ -121,14 +120,18 @@ class FolderCameras:
             if status.st_ctime < begin
         }
 
-    def collect(self, expected: int, seconds: float) -> dict[str, list[Shot]]:
+    def collect(self, expected: int) -> dict[str, list[Shot]]:
         """Return the complete frames since `start`: files whose size is stable and
         whose header can be read.
+
+        They are in the order of their numbers if a camera counts its files, and
+        otherwise of their arrival in the folder, which is uncertain if it contradicts
+        names that increase or if two arrive together.
         """
-        end = self._clock.monotonic() + seconds
-        changed = self._clock.monotonic()
+        now = self._clock.monotonic()
+        changed = dict.fromkeys(self._ids, now)
         sizes = dict[Path, int]()
-        complete: dict[str, dict[Path, Shot]] = {name: {} for name in self._ids}
+        complete: dict[str, dict[Path, float]] = {name: {} for name in self._ids}
         while True:
             for name in self._ids:
                 for path, status in self._files(name, complete[name]):
@@ -138,19 +141,18 @@ class FolderCameras:
                         sizes.get(path) == status.st_size > 0
                         and frame_size(path) is not None
                     ):
-                        complete[name][path] = Shot(path, status.st_mtime)
+                        complete[name][path] = status.st_ctime
                     if sizes.get(path) != status.st_size:
                         sizes[path] = status.st_size
-                        changed = self._clock.monotonic()
+                        changed[name] = now
             now = self._clock.monotonic()
-            enough = all(len(shots) >= expected for shots in complete.values())
-            if enough or now > end or now > changed + self._quiet:
+            if all(
+                len(complete[name]) >= expected or now > changed[name] + self._quiet
+                for name in self._ids
+            ):
                 break
             self._clock.sleep(LOOK_SECONDS)
-        return {
-            name: sorted(shots.values(), key=lambda shot: (shot.time, shot.path))
-            for name, shots in complete.items()
-        }
+        return {name: _ordered(files) for name, files in complete.items()}
 
     def _files(
         self, name: str, complete: Collection[Path] = ()
@@ -169,74 +171,36 @@ class FolderCameras:
         return files
 
 
-def match_frames(shots: Sequence[Shot], triggers: Sequence[float]) -> list[Path | None]:
-    """Assign a frame to every trigger, or None if its frame is missing.
-
-    If there are as many frames as triggers, they are assigned in order, unless precise
-    times of the files contradict it. Otherwise they are assigned by time: the clocks of
-    camera and controller are assumed to differ by a constant offset, the one that
-    matches most frames to a trigger. A frame matches a trigger if it is off by less
-    than half of the shortest interval between triggers. If two offsets match equally
-    well, no frame is assigned, because repeating frames is better than confusing them.
-
-    Parameters
-    ----------
-    shots
-        Frames of one camera, in the order in which they were taken.
-    triggers
-        Times of the triggers [s].
-    """
-    if not shots or not triggers:
-        return [None] * len(triggers)
-    times = np.array([shot.time for shot in shots])
-    due = np.array(triggers)
-    reach = 0.5 * float(np.diff(due).min()) if len(due) > 1 else np.inf
-    if len(shots) == len(triggers) and not _contradicted(times, due, reach):
-        return [shot.path for shot in shots]
-    best = _assignment(times, due, reach)
-    if best is None:
-        return [None] * len(triggers)
-    return [shots[i].path if i >= 0 else None for i in best]
+def _ordered(arrivals: Mapping[Path, float]) -> list[Shot]:
+    """Files of one camera in the order in which they were taken."""
+    named = sorted(arrivals, key=lambda path: (_numbers(path), path.name))
+    if len(named) < 2 or _are_counted(named):
+        return [Shot(path) for path in named]
+    place = {path: i for i, path in enumerate(named)}
+    paths = sorted(arrivals, key=lambda path: (arrivals[path], place[path]))
+    times = np.array([arrivals[path] for path in paths])
+    is_together = np.diff(times) < MIN_ARRIVAL_SECONDS
+    contradicted = np.diff([place[path] for path in paths]) < 0
+    if contradicted.mean() > MAX_CONTRADICTED:
+        contradicted = np.zeros_like(contradicted)
+    doubtful = [False, *(is_together | contradicted).tolist()]
+    return [Shot(path, unsure) for path, unsure in zip(paths, doubtful, strict=True)]
 
 
-def _contradicted(times: Float64, due: Float64, reach: float) -> bool:
-    """Whether nearly all frames fit triggers precisely, but not in their order.
+def _numbers(path: Path) -> tuple[int, ...]:
+    """Numbers in a name."""
+    return tuple(map(int, re.findall(r"\d+", path.name)))
 
-    This happens if a file is written again, or if the controller reports another trigger as lost.
-    """
-    if len(due) < MIN_PRECISE_FRAMES:
+
+def _are_counted(paths: Sequence[Path]) -> bool:
+    """Whether sorted names differ in one number only, which increases by one."""
+    texts = {re.sub(r"\d+", "", path.name) for path in paths}
+    varying = [
+        numbers
+        for numbers in zip(*map(_numbers, paths), strict=False)
+        if len(set(numbers)) > 1
+    ]
+    if len(texts) > 1 or len(varying) != 1:
         return False
-    precise = _assignment(times, due, PRECISE * reach)
-    if precise is None:
-        return False
-    matched = precise >= 0
-    moved = precise[matched] != np.flatnonzero(matched)
-    return bool(matched.sum() >= MIN_PRECISE_FRACTION * len(due) and moved.any())
-
-
-def _assignment(times: Float64, due: Float64, reach: float) -> Index | None:
-    """Index of the frame of every due time, -1 if there is none; None if two offsets of
-    the clocks fit equally well.
-    """
-    tried = times[:: max(len(times) // CANDIDATES, 1)]
-    offsets = np.unique((tried[:, None] - due).ravel())
-    fits = [_nearest(times - offset, due, reach) for offset in offsets]
-    count = np.array([(index >= 0).sum() for index in fits])
-    error = np.empty(len(fits))
-    for k, (index, offset) in enumerate(zip(fits, offsets, strict=True)):
-        matched = index >= 0
-        error[k] = np.abs(times[index[matched]] - offset - due[matched]).sum()
-    order = np.lexsort((error, -count))
-    best: Index = fits[order[0]]
-    limit = 2 * error[order[0]] + AMBIGUOUS * reach * len(times)
-    for candidate in order[1:]:
-        rivals = count[candidate] == count[order[0]] and error[candidate] <= limit
-        if rivals and not np.array_equal(fits[candidate], best):
-            return None
-    return best
-
-
-def _nearest(times: Float64, due: Float64, reach: float) -> Index:
-    """Index of the frame nearest to each due time within reach, -1 if there is none."""
-    index = np.searchsorted((times[:-1] + times[1:]) / 2, due)
-    return np.where(np.abs(times[index] - due) < reach, index, -1)
+    steps = [b - a for a, b in pairwise(varying[0])]
+    return steps.count(1) >= MIN_COUNTED * len(steps)

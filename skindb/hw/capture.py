@@ -23,6 +23,7 @@ from skindb.hw.capture_folder import (
     write_capture,
 )
 from skindb.hw.dome import Dome
+from skindb.hw.frame_markers import marker_light, with_markers
 from skindb.hw.probe import PRESSURE_KPA, PlacementError, Probe
 from skindb.hw.sequence import (
     DARK,
@@ -30,7 +31,6 @@ from skindb.hw.sequence import (
     Override,
     Rehearsal,
     Schedule,
-    measured_flashes,
     plan_schedule,
     rehearsal_notes,
     require_safe,
@@ -145,6 +145,7 @@ def run_capture(
     _require_devices(setup, devices, plan)
     session = open_unfinished(out, identity(setup, subject))
     schedule = planned_schedule(setup, plan)
+    light = marker_light(setup.dome)
     notes = _keep_interrupted(session, setup, devices)
     remaining = (
         remaining_schedule(schedule, session.sequence) if session.sequence else schedule
@@ -154,19 +155,20 @@ def run_capture(
         require_space(out, setup, len(remaining.steps))
         if isinstance(override, Rehearsal):
             notes += rehearsal_notes(remaining, override)
-        run = _run_lights(session, devices, remaining, override, progress)
+        run = _run_lights(session, devices, remaining, light, override, progress)
         _keep_run(session, run, setup)
         require_complete(run, setup.cameras)
         notes += run.notes
     notes += _measure_sites(session, setup, devices, plan, place, progress or silent)
     write_capture(session, setup, subject, files=files)
-    return _report(session, schedule, run, notes)
+    return _report(session, schedule, light, run, notes)
 
 
 def _run_lights(
     session: Unfinished,
     devices: Devices,
     remaining: Schedule,
+    light: str,
     override: Override | Rehearsal | None,
     progress: Progress | None,
 ) -> DomeRun:
@@ -183,6 +185,7 @@ def _run_lights(
             devices.dome,
             devices.cameras,
             remaining,
+            marker_light=light,
             override=override,
             begin=lambda part: session.begin_run(part, clock.now()),
             progress=progress,
@@ -190,12 +193,11 @@ def _run_lights(
     except InputError:  # nothing was lit
         before.save()
         raise
-    flashes = measured_flashes(remaining, run.measured)
-    if flashes > assessment.flashes_per_second:
-        session.count(flashes, confirmed)
+    if run.flashes > assessment.flashes_per_second:
+        session.count(run.flashes, confirmed)
         planned = f"{assessment.flashes_per_second} were planned"
         run.notes.append(
-            f"the controller flashed {flashes} times in a second, and {planned}"
+            f"the controller flashed {run.flashes} times in a second, and {planned}"
         )
     return run
 
@@ -205,7 +207,8 @@ def _keep_run(session: Unfinished, run: DomeRun, setup: Setup) -> None:
     failed = failed_lights(run.schedule, run.frames, setup.dome)
     run.faulty_lights = failed | run.faulty_lights
     forget_faulty_steps(run)
-    session.running = None
+    if run.is_reported:
+        session.running = None
     keep_frames(session, run, setup)
 
 
@@ -296,14 +299,18 @@ def _measure_sites(
 
 
 def _report(
-    session: Unfinished, schedule: Schedule, run: DomeRun | None, notes: list[str]
+    session: Unfinished,
+    schedule: Schedule,
+    light: str,
+    run: DomeRun | None,
+    notes: list[str],
 ) -> dict[str, Any]:
     return {
         "path": str(session.folder),
         "steps": len(schedule.steps),
         "frames": len(list((session.folder / "dome/frames").glob("*/*"))),
         "frames_of_this_session": 0 if run is None else len(run.frames),
-        "seconds": schedule.seconds,
+        "seconds": with_markers(schedule, light).seconds,
         "flashes_per_second": session.flashes_per_second,
         "sites": sorted({entry["site"] for entry in session.sites}),
         "notes": notes,

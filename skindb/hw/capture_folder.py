@@ -9,7 +9,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -86,9 +86,7 @@ class Unfinished:
 
     def begin_run(self, part: Schedule, now: float) -> None:
         """Record the steps that run from now on [s since 1970], in case this process is killed."""
-        steps = [
-            [step.light, step.exposure, step.on_us, step.off_us] for step in part.steps
-        ]
+        steps = [astuple(step) for step in part.steps]
         self.running = {"steps": steps, "started": now}
         self.save()
 
@@ -334,10 +332,13 @@ def keep_frames(session: Unfinished, run: DomeRun, setup: Setup) -> None:
     offset = max((float(entry["t_off"]) for entry in entries), default=0.0)
     suffix = next((path.suffix for path in run.frames.values()), ".png")
     added = []
+    kept = {(entry["light"], entry["exposure"]) for entry in entries}
     for i, (step, measured) in enumerate(
         zip(run.schedule.steps, run.measured, strict=True)
     ):
         if i in missing or measured is None or step.light == DARK:
+            continue
+        if (step.light, step.exposure) in kept:
             continue
         for camera in cameras:
             name = FRAMES.format(

@@ -13,6 +13,7 @@ from __future__ import annotations
 import binascii
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 from skindb.errors import Fault, InputError, input_error, require
@@ -37,6 +38,12 @@ class Step:
     exposure: str
     on_us: int
     off_us: int
+    marker: bool = False  # see `skindb.hw.frame_markers`
+
+    @property
+    def name(self) -> str:
+        """Light and exposure for messages."""
+        return f"light {self.light} exposure {self.exposure}"
 
 
 @dataclass(frozen=True)
@@ -49,6 +56,12 @@ class Schedule:
     def seconds(self) -> float:
         """Duration from the start until the last light is off."""
         return self.steps[-1].off_us / 1e6 if self.steps else 0.0
+
+    @property
+    def markers(self) -> int:
+        """Number of its markers."""
+        flags = [False, *(step.marker for step in self.steps)]
+        return sum(b and not a for a, b in pairwise(flags))
 
     @property
     def digest(self) -> str:
@@ -223,12 +236,12 @@ def assess(schedule: Schedule, *, window_us: int = WINDOW_US) -> Assessment:
     return Assessment(flashes, schedule.seconds)
 
 
-def measured_flashes(schedule: Schedule, measured: Sequence[Measured | None]) -> int:
-    """Largest number of flashes in any second by the measured times."""
-    steps = list[Step]()
-    for step, times in zip(schedule.steps, measured, strict=True):
-        if times is not None:
-            steps.append(replace(step, on_us=times.on_us, off_us=times.off_us))
+def measured_flashes(schedule: Schedule, measured: Sequence[Measured]) -> int:
+    """Largest number of flashes in any second by the measured times of the first steps."""
+    steps = [
+        replace(step, on_us=times.on_us, off_us=times.off_us)
+        for step, times in zip(schedule.steps, measured, strict=False)
+    ]
     lit = Schedule(tuple(steps))
     return assess(lit, window_us=WINDOW_US - 2 * MAX_JITTER_US).flashes_per_second
 

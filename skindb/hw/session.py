@@ -7,9 +7,10 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
-from skindb.errors import Fault, InputError
-from skindb.hw.cameras import Cameras, match_frames
+from skindb.errors import Fault, InputError, few_names
+from skindb.hw.cameras import Cameras
 from skindb.hw.dome import STOPPED, Dome
+from skindb.hw.frame_markers import exposures_problem, identify_frames, with_markers
 from skindb.hw.link import DeviceError, RefusedError
 from skindb.hw.probe import PRESSURE_KPA, Placement, PlacementError, Probe
 from skindb.hw.sequence import (
@@ -19,6 +20,7 @@ from skindb.hw.sequence import (
     Rehearsal,
     Schedule,
     Step,
+    measured_flashes,
     partial_schedule,
     require_safe,
 )
@@ -26,13 +28,10 @@ from skindb.types import Progress, silent
 
 # runs after the first one; frames that are still missing then indicate a broken device
 MAX_REPEATS = 3
-FRAME_SECONDS = 10.0  # timeout for the last frames to be written
-LOST_FRAME_SECONDS = 1.0  # the same timeout if the expected number of frames is unknown
 # per exposure before the lights, of which the mean is kept: they take 1.5 s for two
 # exposures
 DARK_FRAMES = 4
-# around dark frames: with uneven intervals a missing frame can be identified
-PAUSE_US = 250_000
+PAUSE_US = 250_000  # around dark frames
 # current of a light, relative to its nominal current
 MIN_LEVEL = 0.9
 MAX_LEVEL = 1.1
@@ -51,9 +50,14 @@ class DomeRun:
     # camera, step -> file
     frames: dict[tuple[str, int], Path] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    # why frames of the last part that ran were not identified
+    problems: list[str] = field(default_factory=list)
     # light -> description of its failure
     faulty_lights: dict[str, str] = field(default_factory=dict)
     stopped: str = ""  # reason if the run ended early
+    flashes: int = 0  # largest measured number in a second
+    # otherwise the controller may know more of the last part that ran
+    is_reported: bool = True
 
     def forget(self, step: int) -> None:
         """Discard the measurements and frames of a step."""
@@ -96,6 +100,7 @@ def capture_dome(
     cameras: Cameras,
     schedule: Schedule,
     *,
+    marker_light: str,
     override: Override | Rehearsal | None = None,
     begin: Callable[[Schedule], None] = lambda _part: None,
     progress: Progress | None = None,
@@ -108,11 +113,13 @@ def capture_dome(
         The devices.
     schedule
         Steps to run, for example ``with_dark_frames(plan_schedule(...))``.
+    marker_light
+        Light that all cameras see, for the markers between which frames are identified.
     override
         Confirmation of an operator for more than three flashes in a second, or a rehearsal.
     begin
-        Called with the steps that are about to run: the whole schedule, and then those
-        that are repeated.
+        Called with the steps that are about to run, with their markers: the whole
+        schedule, and then those that are repeated.
     progress
         Called with the stage, the steps done and the steps in all.
 
@@ -136,8 +143,11 @@ def capture_dome(
     clock = dome.link.clock
     remaining = list(range(len(schedule.steps)))
     begin_time = 0.0  # when the first run began
+    markers = 0  # of the runs before
     for attempt in range(1 + MAX_REPEATS):
         part = partial_schedule(schedule, remaining) if attempt else schedule
+        part = with_markers(part, marker_light, first=markers)
+        markers += part.markers
         cameras.start()
         try:
             dome.upload(part)
@@ -161,7 +171,7 @@ def capture_dome(
         if run.stopped or not missing:
             break
         remaining = sorted(missing)
-        run.notes.append(f"{_describe_missing(schedule, missing)}: repeated")
+        run.notes.append(f"{_describe_missing(run, missing)}: repeated")
     if dome.link.damaged:
         run.notes.append(f"{dome.link.name}: {dome.link.damaged} damaged lines")
     run.faulty_lights = _faulty_lights(run)
@@ -181,7 +191,7 @@ def recover_run(
     dome, cameras
         The devices.
     schedule, started
-        The steps that ran, and when they began [s since 1970].
+        The steps that ran, with their markers, and when they began [s since 1970].
 
     Returns
     -------
@@ -192,10 +202,11 @@ def recover_run(
         return None
     dome.stop()
     cameras.start(started)
-    run = DomeRun(schedule, [None] * len(schedule.steps))
+    steps = tuple(step for step in schedule.steps if not step.marker)
+    run = DomeRun(Schedule(steps), [None] * len(steps))
     reports = StepReports()
     reports.read(dome, schedule)
-    _collect(run, cameras, range(len(schedule.steps)), schedule, reports)
+    _collect(run, cameras, range(len(steps)), schedule, reports)
     run.faulty_lights = _faulty_lights(run)
     return run
 
@@ -265,34 +276,39 @@ def _collect(
     part: Schedule,
     reports: StepReports,
 ) -> None:
-    """Assign frames to the finished steps of a part, which have these indices in the
-    schedule; steps without a trigger have no frame.
+    """Assign frames to the finished steps of a part with markers, whose other steps have
+    these indices in the schedule; steps without a trigger have no frame.
 
-    If reports are missing, frames are matched with the whole plan, and only those of
-    reported steps are kept.
+    If reports are missing, the steps without one may have been triggered.
     """
     reported = reports.measured
-    steps = [i for i, measured in enumerate(reported) if measured.triggers > 0]
-    if not reports.complete:
-        steps += range(len(reported), len(part.steps))
-    times = [part.steps[i].on_us / 1e6 for i in steps]
-    for index, measured in zip(indices, reported[: reports.finished], strict=False):
-        run.measured[index] = measured
+    run.is_reported = reports.complete
+    index = iter(indices)
+    # of the steps of the part that are no markers
+    places = {i: next(index) for i, step in enumerate(part.steps) if not step.marker}
+    lost = [i for i, measured in enumerate(reported) if measured.triggers == 0]
+    ran = len(reported) if reports.complete else len(part.steps)
+    while ran - 1 in lost:
+        ran -= 1
+    lost = [i for i in lost if i < ran]
+    run.flashes = max(run.flashes, measured_flashes(part, reported))
+    for i, measured in enumerate(reported[: reports.finished]):
+        if i in places:
+            run.measured[places[i]] = measured
     try:
-        timeout = FRAME_SECONDS if reports.complete else LOST_FRAME_SECONDS
-        taken = cameras.collect(len(steps), timeout)
+        taken = cameras.collect(ran - len(lost))
     except InputError as error:  # such as a folder that is gone
         run.stopped = run.stopped or _reason(error)
         return
+    run.problems = []
     for camera, shots in taken.items():
-        if reports.complete and len(shots) != len(steps):
-            run.notes.append(
-                f"camera {camera}: {len(shots)} frames for {len(steps)} triggers"
-            )
-        paths = match_frames(shots, times)
-        for i, path in zip(steps, paths, strict=True):
-            if path is not None and i < reports.finished:
-                run.frames[camera, indices[i]] = path
+        frames, problems = identify_frames(shots, part.steps[:ran], lost)
+        run.problems += [f"camera {camera}: {problem}" for problem in problems]
+        run.frames |= {
+            (camera, places[i]): path
+            for i, path in frames.items()
+            if i < reports.finished
+        }
 
 
 def forget_faulty_steps(run: DomeRun) -> None:
@@ -329,7 +345,7 @@ def require_complete(run: DomeRun, cameras: Sequence[str]) -> None:
             Fault(
                 "capture",
                 "every step must have a frame of every camera",
-                _describe_missing(run.schedule, lost),
+                _describe_missing(run, lost),
                 cure,
             )
         )
@@ -349,14 +365,17 @@ def require_complete(run: DomeRun, cameras: Sequence[str]) -> None:
         raise InputError(faults)
 
 
-def _describe_missing(schedule: Schedule, lost: Mapping[int, Sequence[str]]) -> str:
-    """Number of missing frames, and the first of them."""
+def _describe_missing(run: DomeRun, lost: Mapping[int, Sequence[str]]) -> str:
+    """Number of missing frames, the first of them, and why they were not identified."""
     names = [
-        f"light {schedule.steps[i].light} exposure {schedule.steps[i].exposure} camera {camera}"
+        f"{run.schedule.steps[i].name} camera {camera}"
         for i, cameras in lost.items()
         for camera in cameras
     ]
-    return f"{len(names)} missing frames: {'; '.join(names[:5])}{'; ...' if len(names) > 5 else ''}"
+    # of a run that was stopped, the last markers are missing as well
+    problems = [] if run.stopped else run.problems
+    reasons = f" ({few_names(problems, separator='; ')})" if problems else ""
+    return f"{len(names)} missing frames: {few_names(names, 5, '; ')}{reasons}"
 
 
 def _faulty_lights(run: DomeRun) -> dict[str, str]:
@@ -426,14 +445,19 @@ def capture_site(
     """
     camera.start()
     placement = probe.measure(exposures, pressure=pressure, progress=progress)
-    [(name, shots)] = camera.collect(len(exposures), FRAME_SECONDS).items()
+    [(name, shots)] = camera.collect(len(exposures)).items()
     triggers = sum(placement.triggers.values())
-    if not len(shots) == triggers == len(exposures):
+    problem = (
+        f"{len(shots)} frames for {triggers} triggers and {len(exposures)} exposures"
+    )
+    if len(shots) == triggers == len(exposures):
+        problem = exposures_problem(shots, [*exposures])
+    if problem:
         raise PlacementError(
             Fault(
                 f"camera {name}",
                 "must take a frame of every exposure",
-                f"{len(shots)} frames for {triggers} triggers and {len(exposures)} exposures",
+                problem,
                 f"measure {site} again",
             )
         )

@@ -175,8 +175,8 @@ class EmulatedDome(Emulated):
     lights
         Ids of its lights.
     trigger
-        Called with the exposure, how bright each light is that shines ("-" for none),
-        and the time [s] since the start, whenever the cameras are triggered.
+        Called with the exposure and how bright each light is that shines ("-" for none)
+        whenever the cameras are triggered.
     faults, clock
         As for `Emulated`.
     """
@@ -186,7 +186,7 @@ class EmulatedDome(Emulated):
     def __init__(
         self,
         lights: tuple[str, ...],
-        trigger: Callable[[str, dict[str, float], float], None],
+        trigger: Callable[[str, dict[str, float]], None],
         faults: DeviceFaults | None = None,
         *,
         clock: Clock = SYSTEM_CLOCK,
@@ -264,7 +264,7 @@ class EmulatedDome(Emulated):
         wrong = {self._stuck: 1.0} if self._stuck else {}
         shines = 0.0 if step.light == self.faults.dead_light else level
         if not lost:
-            self._trigger(step.exposure, wrong | {step.light: shines}, step.on_us / 1e6)
+            self._trigger(step.exposure, wrong | {step.light: shines})
         measured = bool(self._stuck) and self._stuck != self.faults.silently_stuck_light
         rest = measured or step.light == self.faults.stuck_light
         total = level * (step.light != "-") + measured

@@ -5,8 +5,8 @@ write its frames into folders.
 from __future__ import annotations
 
 import json
-import os
 import shutil
+from collections import deque
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -27,8 +27,6 @@ from skindb.virtual.devices import (
     EmulatedProbe,
 )
 
-# arbitrary wall time, as cameras do not know when the controller started
-FIRST_FRAME_TIME = 1_700_000_000.0
 PROBABILITIES = ("garbage", "lost_replies")  # of `DeviceFaults`
 MAX_FAULT = 1e6  # of any number of a fault
 
@@ -42,6 +40,8 @@ class LaboratoryFaults:
     # camera and number of the trigger, counted from 0
     dropped_frames: tuple[tuple[str, int], ...] = ()
     dropped_probe_frames: tuple[int, ...] = ()
+    repeated_frames: tuple[tuple[str, int], ...] = ()  # delivered twice
+    late_seconds: float = 0.0  # after the exposure, when a frame is in its folder
 
 
 class Laboratory:
@@ -79,6 +79,12 @@ class Laboratory:
         self.cameras = tuple(str(camera["id"]) for camera in self._record["cameras"])
         self.site = ""  # current site of the probe
         self._triggers = dict.fromkeys((*self.cameras, "probe"), 0)
+        self._files = dict.fromkeys(self.cameras, 0)
+        self._rng = np.random.default_rng(0)
+        self._copied = set[Path]()  # pictures that were delivered without new noise
+        self._late = deque[tuple[float, Path, Path]]()  # when, file, its final name
+        if isinstance(self.clock, SimulatedClock):
+            self.clock.attach(self._deliver)
         lights = tuple(str(light["id"]) for light in self._record["lights"])
         self.dome = EmulatedDome(
             lights, self._photograph, self.faults.dome, clock=self.clock
@@ -102,43 +108,46 @@ class Laboratory:
         """Put the probe on a site of the subject."""
         self.site = site
 
-    def _photograph(
-        self, exposure: str, factors: dict[str, float], seconds: float
-    ) -> None:
+    def _photograph(self, exposure: str, factors: dict[str, float]) -> None:
         """Every camera takes a frame under these lights, each with its factor."""
+        lit = {name: factor for name, factor in factors.items() if name != "-"}
         for camera in self.cameras:
             number = self._count(camera)
             if (camera, number) in self.faults.dropped_frames:
                 continue
-            target = self.watched / camera / f"IMG_{number:05d}.png"
-            lit = {name: factor for name, factor in factors.items() if name != "-"}
-            self._write(target, camera, exposure, lit, FIRST_FRAME_TIME + seconds)
+            partial = self._queue(camera)
+            self._expose(partial, camera, exposure, lit)
+            if (camera, number) in self.faults.repeated_frames:
+                shutil.copyfile(partial, self._queue(camera))
+        self._deliver()
 
-    def _write(
-        self,
-        target: Path,
-        camera: str,
-        exposure: str,
-        factors: dict[str, float],
-        stamp: float,
-    ) -> None:
-        """Write a frame atomically, like tethering tools, which rename a file when it
-        is complete.
+    def _queue(self, camera: str) -> Path:
+        """Path to which the next frame of a camera is written, like a tethering tool does,
+        which renames the file when it is complete.
         """
+        target = self.watched / camera / f"IMG_{self._files[camera]:05d}.png"
+        self._files[camera] += 1
         partial = target.with_suffix(".part")
-        self._expose(partial, camera, exposure, factors)
-        os.utime(partial, (stamp, stamp))
-        partial.rename(target)
+        due = self.clock.monotonic() + self.faults.late_seconds
+        self._late.append((due, partial, target))
+        return partial
+
+    def _deliver(self) -> None:
+        """Give the frames that are due their final names."""
+        while self._late and self._late[0][0] <= self.clock.monotonic():
+            _, partial, target = self._late.popleft()
+            partial.rename(target)
 
     def _expose(
         self, target: Path, camera: str, exposure: str, factors: dict[str, float]
     ) -> None:
         dark = self._source("dark", camera, exposure)
         if [*factors.values()] == [1.0]:
-            shutil.copyfile(
-                self._required(camera, exposure, next(iter(factors))), target
-            )
-            return
+            source = self._required(camera, exposure, next(iter(factors)))
+            if source not in self._copied:
+                self._copied.add(source)
+                shutil.copyfile(source, target)
+                return
         record = next(
             entry for entry in self._record["cameras"] if entry["id"] == camera
         )
@@ -152,6 +161,8 @@ class Laboratory:
         base = value.copy()
         for light, factor in factors.items():
             value += factor * (_read(self._required(camera, exposure, light)) - base)
+        # noise of reading: no two frames of a sensor are equal
+        value += self._rng.standard_normal(value.shape)
         png = imagecodecs.png_encode(
             np.clip(np.rint(value), 0, white).astype(np.uint16)
         )
@@ -215,14 +226,20 @@ def laboratory_faults(
     """
     kinds = {spec.name: str(spec.type) for spec in fields(DeviceFaults)}
     devices: dict[str, dict[str, Any]] = {"dome": {}, "probe": {}}
-    dropped = list[tuple[str, int]]()
+    frames: dict[str, list[tuple[str, int]]] = {
+        "dropped_frame": [],
+        "repeated_frame": [],
+    }
+    late = 0.0
     for text in texts:
         name, _, value = text.partition("=")
         device, _, fault = name.rpartition(".")
         try:
-            if name == "dropped_frame":
+            if name in frames:
                 camera, number = value.split(":")
-                dropped.append((_word(camera, cameras), _count(number)))
+                frames[name].append((_word(camera, cameras), _count(number)))
+            elif name == "late_seconds":
+                late = _number(value)
             else:
                 setting = _fault_value(fault, kinds[fault], value, lights)
                 devices[device][fault] = setting
@@ -230,7 +247,8 @@ def laboratory_faults(
             names = ", ".join(f"dome.{n}" for n in kinds)
             raise input_error(
                 "--fault",
-                f"must be dropped_frame=CAMERA:NUMBER, {names}, or the same with probe",
+                "must be dropped_frame=CAMERA:NUMBER, repeated_frame=CAMERA:NUMBER, "
+                f"late_seconds=SECONDS, {names}, or the same with probe",
                 repr(text),
                 "numbers are not negative, probabilities at most 1, lights and cameras "
                 "those of the set-up",
@@ -238,7 +256,8 @@ def laboratory_faults(
     if not texts:
         return None
     dome, probe = (DeviceFaults(**settings) for settings in devices.values())
-    return LaboratoryFaults(dome, probe, tuple(dropped))
+    dropped, repeated = (tuple(numbers) for numbers in frames.values())
+    return LaboratoryFaults(dome, probe, dropped, (), repeated, late)
 
 
 def _fault_value(fault: str, kind: str, value: str, lights: Collection[str]) -> Any:
@@ -249,9 +268,13 @@ def _fault_value(fault: str, kind: str, value: str, lights: Collection[str]) -> 
         return _word(value, GAUGE_FAULTS if fault == "gauge" else lights)
     if kind == "int":
         return _count(value)
-    number = float(value)
-    if not 0.0 <= number <= (1.0 if fault in PROBABILITIES else MAX_FAULT):
-        raise ValueError(value)
+    return _number(value, 1.0 if fault in PROBABILITIES else MAX_FAULT)
+
+
+def _number(text: str, maximum: float = MAX_FAULT) -> float:
+    number = float(text)
+    if not 0.0 <= number <= maximum:
+        raise ValueError(text)
     return number
 
 

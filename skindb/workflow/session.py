@@ -26,6 +26,7 @@ from skindb.hw.capture_folder import (
     read_setup,
 )
 from skindb.hw.dome import Dome
+from skindb.hw.frame_markers import marker_light, with_markers
 from skindb.hw.link import Link, open_port
 from skindb.hw.probe import Probe
 from skindb.hw.sequence import Override, Rehearsal, assess, slower_alternative
@@ -59,7 +60,7 @@ def plan_session(
     with private_umask(), _laboratory(out, parameters, progress) as laboratory:
         setup = _setup(parameters, laboratory)
     plan = _plan(setup, parameters)
-    schedule = planned_schedule(setup, plan)
+    schedule = with_markers(planned_schedule(setup, plan), marker_light(setup.dome))
     assessment = assess(schedule)
     lines = [
         f"{len(setup.lights)} lights, {len(setup.dome.exposures)} exposures, "

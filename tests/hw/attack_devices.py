@@ -1,6 +1,10 @@
 """Attack sessions with devices that misbehave at random; see docs/reliability.md.
 
     python tests/hw/attack_devices.py --cases 1000 --seed 0
+    python tests/hw/attack_devices.py --cases 500 --seed 0 --frames
+
+With `--frames` it is the cameras that misbehave: each drops frames and delivers others
+twice, late by up to 12 s, while the line to the controller has noise or is lost.
 
 Each case is a session with a controller and a probe whose messages are changed, lost,
 repeated, delayed or invented, whose checksums are right, and which may ignore requests.
@@ -31,6 +35,7 @@ from devices_pair import (
     EXPOSURES,
     LIGHTS,
     OVERRIDE,
+    is_frame,
     subject_folder,
     value_of,
 )
@@ -43,8 +48,8 @@ from skindb.hw.capture_folder import Subject, read_setup
 from skindb.hw.dome import Dome
 from skindb.hw.link import EVENT, OK, REPLY, Lines, Link, Message
 from skindb.hw.probe import Probe
-from skindb.virtual.devices import DirectPort
-from skindb.virtual.laboratory import Laboratory
+from skindb.virtual.devices import DeviceFaults, DirectPort
+from skindb.virtual.laboratory import Laboratory, LaboratoryFaults
 
 PERSON = Subject(
     "S1", "2026-01-01T10:00:00+00:00", {"scope": ["fit"], "reference": "none"}
@@ -52,9 +57,9 @@ PERSON = Subject(
 PLAN = CapturePlan(seconds=2.0, sites=("cheek",))
 ATTACKED_LIGHTS = LIGHTS[::3]
 LONG_BRACKETS = {name: 10 * seconds for name, seconds in BRACKETS.items()}
-# By the simulated clock: four runs of 17 steps with their uploads, reports and last
-# frames, and three placements.
-MAX_SECONDS = 4 * (19 * 0.3 + 5.0 + 2.0 + 18 * 0.9 + 10.0) + 3 * 30.0
+# By the simulated clock: four runs of 54 steps, of which 21 are flashes of markers, with
+# their uploads, reports and last frames, and three placements.
+MAX_SECONDS = 4 * (56 * 0.3 + 5.0 + 2.0 + 55 * 0.9 + 15.0 + 12.0) + 3 * 45.0
 ODD_VALUES = (
     *(
         "nan",
@@ -320,12 +325,13 @@ class Session:
         self.folder = folder
         self.out = folder / "C"
 
-    def run(self, attacks=(), seed=0):
+    def run(self, attacks=(), seed=0, faults=None):
         """Run once; returns the text of the refusal, with the laboratory and its clock
         as they are then.
         """
         clock = SimulatedClock()
-        laboratory = Laboratory(self.setup, self.folder / "watched", clock=clock)
+        watched = self.folder / "watched"
+        laboratory = Laboratory(self.setup, watched, faults, clock=clock)
         rng = np.random.default_rng(seed)
         ports = {}
         for name in ("dome", "probe"):
@@ -389,11 +395,28 @@ class Session:
         )
 
 
-def violations(setup, folder, seed):
+def frame_faults(seed):
+    """Frames that are lost, repeated and late, and a line with noise or that is lost."""
+    rng = np.random.default_rng([seed, 35])
+    count = int(rng.integers(0, 4))
+    dropped, repeated = (
+        tuple((str(rng.choice(CAMERAS)), int(rng.integers(54))) for _ in range(count))
+        for _ in range(2)
+    )
+    line = {"garbage": 0.3, "delay": 0.05, "vanish_after": int(rng.integers(60, 160))}
+    kind = str(rng.choice([*line, "none"]))
+    dome = DeviceFaults(**({kind: line[kind]} if kind in line else {}), seed=seed)
+    late = float(rng.choice([0.0, 0.5, 12.0]))
+    return LaboratoryFaults(
+        dome, dropped_frames=dropped, repeated_frames=repeated, late_seconds=late
+    )
+
+
+def violations(setup, folder, seed, *, faults=None):
     """Run a case; returns the outcome, and what must not be."""
     session = Session(setup, folder)
-    attacks = attacks_of(seed)
-    refusal, laboratory, clock = session.run(attacks, seed)
+    attacks = [] if faults else attacks_of(seed)
+    refusal, laboratory, clock = session.run(attacks, seed, faults)
     wrong = []
     if laboratory.dome.on is not None or laboratory.dome.state == "running":
         wrong.append("a light is on")
@@ -424,9 +447,8 @@ def violations(setup, folder, seed):
     after = session.kept()
     wrong += wrong_content(*after)
     wrong += lost_content(before, after)
-    if len(after[1]) != len(ATTACKED_LIGHTS) * len(EXPOSURES) or [*after[2]] != [
-        ("cheek", 1)
-    ]:
+    steps = json.loads((setup / "dome/dome.json").read_text())["lights"]
+    if len(after[1]) != len(steps) * len(EXPOSURES) or [*after[2]] != [("cheek", 1)]:
         wrong.append("the capture is not complete")
     return ("refused" if refusal else "complete"), wrong, refusal
 
@@ -440,9 +462,8 @@ def wrong_content(files, sequence, logs):
                 f"dome/frames/{entry['exposure']}/{entry['light']}_{camera}.png"
             )
             value = value_of(entry["light"], camera, entry["exposure"])
-            if (
-                path not in files
-                or not (imagecodecs.png_decode(files[path]) == value).all()
+            if path not in files or not is_frame(
+                imagecodecs.png_decode(files[path]), value
             ):
                 wrong.append(f"{path} is not the frame of its step")
         times = (entry["t_on"], entry["t_off"])
@@ -489,14 +510,12 @@ def lost_content(before, after):
     ]
 
 
-def attacked_setup(folder):
+def attacked_setup(folder, lights=ATTACKED_LIGHTS):
     """The laboratory of all cases."""
     subject_folder(folder)
     path = folder / "dome/dome.json"
     record = json.loads(path.read_text())
-    record["lights"] = [
-        light for light in record["lights"] if light["id"] in ATTACKED_LIGHTS
-    ]
+    record["lights"] = [light for light in record["lights"] if light["id"] in lights]
     path.write_text(json.dumps(record))
     path = folder / "contact/probe.json"
     record = json.loads(path.read_text()) | {
@@ -520,16 +539,21 @@ def main():
         help="seed of the first case; each has the next one",
     )
     parser.add_argument(
+        "--frames", action="store_true", help="attack the frames of the cameras"
+    )
+    parser.add_argument(
         "--list", action="store_true", help="print attacks and message of every case"
     )
     options = parser.parse_args()
     outcomes = Counter()
     failed = 0
     with tempfile.TemporaryDirectory() as folder:
-        setup = attacked_setup(Path(folder) / "lab")
+        lights = LIGHTS if options.frames else ATTACKED_LIGHTS
+        setup = attacked_setup(Path(folder) / "lab", lights)
         for seed in range(options.seed, options.seed + options.cases):
             case = Path(folder) / "case"
-            outcome, wrong, refusal = violations(setup, case, seed)
+            faults = frame_faults(seed) if options.frames else None
+            outcome, wrong, refusal = violations(setup, case, seed, faults=faults)
             shutil.rmtree(case)
             outcomes[outcome] += 1
             failed += bool(wrong)
@@ -537,7 +561,7 @@ def main():
                 print(
                     seed,
                     outcome,
-                    *attacks_of(seed),
+                    *([faults] if faults else attacks_of(seed)),
                     refusal,
                     *wrong,
                     sep="\n  ",

@@ -32,6 +32,13 @@ def value_of(light: str, camera: str, exposure: str) -> int:
     )
 
 
+def is_frame(found: np.ndarray, value: int) -> bool:
+    """Whether a frame has this value: others differ by 11 at least, and a picture that is
+    taken again has noise with a standard deviation of one.
+    """
+    return bool(np.abs(found.astype(float) - value).max() < 5.5)
+
+
 def _save(path: Path, value: int) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(imagecodecs.png_encode(np.full((4, 6, 3), value, np.uint16)))

@@ -24,6 +24,7 @@ from served_devices import Server, Terminal
 from skindb.clock import SimulatedClock
 from skindb.errors import InputError
 from skindb.hw.dome import Dome
+from skindb.hw.frame_markers import MARKER, with_markers
 from skindb.hw.link import (
     ATTEMPTS,
     EVENT,
@@ -402,7 +403,7 @@ def test_run__watchdog_switches_off_when_the_host_is_silent(seconds):
     assert (device.state, device.reason, device.on) == ("stopped", "watchdog", None)
 
 
-@pytest.mark.parametrize("at", range(1, 8))
+@pytest.mark.parametrize("at", range(MARKER + 1, MARKER + 8))
 def test_run__emergency_stop_at_any_moment(subject, tmp_path, at):
     """Ctrl-C while step `at` is lit: lights off, and every frame so far is kept."""
     slow = plan_schedule(LIGHTS, {"long": 0.9})
@@ -415,13 +416,18 @@ def test_run__emergency_stop_at_any_moment(subject, tmp_path, at):
                 raise KeyboardInterrupt
 
         run = capture_dome(
-            bench.dome, bench.cameras, slow, override=OVERRIDE, progress=interrupt
+            bench.dome,
+            bench.cameras,
+            slow,
+            marker_light=LIGHTS[0],
+            override=OVERRIDE,
+            progress=interrupt,
         )
         assert run.stopped == "stopped by the operator"
         assert bench.laboratory.dome.on is None
         assert bench.laboratory.dome.state == "stopped"
         kept = {step for _, step in run.frames}
-        assert set(range(seen[-1])) <= kept
+        assert set(range(seen[-1] - MARKER)) <= kept
         with pytest.raises(
             InputError, match="must run to its end; found stopped by the operator"
         ):
@@ -453,19 +459,27 @@ def test_replay__a_recorded_session_gives_the_same_sequence(subject, tmp_path):
     log = tmp_path / "dome.log"
     faults = LaboratoryFaults(dome=DeviceFaults(garbage=0.2))
     with Bench(subject, tmp_path / "frames", faults, log=log) as bench:
-        run = capture_dome(bench.dome, bench.cameras, SCHEDULE, override=OVERRIDE)
+        run = capture_dome(
+            bench.dome,
+            bench.cameras,
+            SCHEDULE,
+            marker_light=LIGHTS[0],
+            override=OVERRIDE,
+        )
     clock = SimulatedClock()
     again = Dome(Link(ReplayPort(log, clock=clock), "dome", clock=clock))
-    again.upload(SCHEDULE)
-    again.arm(SCHEDULE, OVERRIDE)
+    marked = with_markers(SCHEDULE, LIGHTS[0])
+    again.upload(marked)
+    again.arm(marked, OVERRIDE)
     done = []
-    assert again.run(SCHEDULE, done=done).state == "done"
-    assert again.state(len(SCHEDULE.steps)).step == len(SCHEDULE.steps)
+    assert again.run(marked, done=done).state == "done"
+    assert again.state(len(marked.steps)).step == len(marked.steps)
     done += [
-        again.report_step(SCHEDULE, index)
-        for index in range(len(done), len(SCHEDULE.steps))
+        again.report_step(marked, index)
+        for index in range(len(done), len(marked.steps))
     ]
-    assert done == run.measured
+    steps = zip(marked.steps, done, strict=True)
+    assert [report for step, report in steps if not step.marker] == run.measured
     with pytest.raises(DeviceError, match="the next request of a replay must be"):
         again.link.request("BEAT")
 

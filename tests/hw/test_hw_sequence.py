@@ -1,4 +1,4 @@
-"""Sequences, safety, matching of frames to triggers."""
+"""Sequences, safety, folders of cameras."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from skindb.clock import SimulatedClock
 from skindb.errors import InputError
-from skindb.hw.cameras import FolderCameras, Shot, match_frames
+from skindb.hw.cameras import FolderCameras
 from skindb.hw.probe import brackets
 from skindb.hw.sequence import (
     DARK,
@@ -159,73 +159,6 @@ def _check_partial_schedule__flashes_no_faster_than_the_whole(seed):
     )
 
 
-def test_match_frames__any_frames_may_be_lost():
-    """A fifth of the frames lost anywhere, clocks of any difference, jitter of a tenth
-    of a period, extra frames.
-    """
-    for seed in range(200):
-        _check_match_frames__any_frames_may_be_lost(seed)
-
-
-def _check_match_frames__any_frames_may_be_lost(seed):
-    rng = np.random.default_rng(seed)
-    schedule = with_dark_frames(
-        plan_schedule(
-            LIGHTS[: int(rng.integers(5, 40))], {"long": 0.04, "short": 0.005}
-        )
-    )
-    due = np.array([step.on_us / 1e6 for step in schedule.steps])
-    period = np.diff(due).min()
-    there = rng.random(len(due)) > rng.uniform(0, 0.2)
-    at = due + rng.uniform(-1e9, 1e9) + rng.uniform(-0.1, 0.1, len(due)) * period
-    shots = [Shot(Path(str(i)), float(at[i])) for i in np.flatnonzero(there)]
-    found = match_frames(shots, list(due))
-    if found == [None] * len(due):  # nobody could tell: all are taken again
-        # a dark frame is lost, whose pauses tell the place of the others
-        assert not there[[0, 1, -1]].all()
-        return
-    right = [i if kept else None for i, kept in enumerate(there)]
-    assert [None if path is None else int(path.name) for path in found] == right
-
-
-def test_match_frames__even_steps_tell_nothing():
-    """The first or the last of ten even steps may be missing: no frame is assigned."""
-    shots = [Shot(Path(str(i)), 50.0 + 0.1 * i) for i in range(9)]
-    assert match_frames(shots, [0.1 * i for i in range(10)]) == [None] * 10
-
-
-def test_match_frames__a_file_that_was_written_again_does_not_exchange_the_others():
-    """As many frames as triggers, but the time of one is later than those of all others."""
-    due = [step.on_us / 1e6 for step in with_dark_frames(PAPER).steps]
-    shots = [Shot(Path(str(i)), 50.0 + at) for i, at in enumerate(due)]
-    late = Shot(Path("20"), 999.0)
-    found = match_frames([*shots[:20], *shots[21:], late], due)
-    assert [None if path is None else int(path.name) for path in found] == [
-        *range(20),
-        None,
-        *range(21, len(due)),
-    ]
-
-
-def test_match_frames__imprecise_times_do_not_matter_if_no_frame_is_missing():
-    """Tethering tools that write the time of the transfer: seconds, or a jitter longer
-    than the steps.
-    """
-    due = np.array([step.on_us / 1e6 for step in with_dark_frames(PAPER).steps])
-    for seed in range(15):
-        rng = np.random.default_rng(seed)
-        jitter = rng.uniform(0.0, rng.uniform(0.01, 2.0), len(due))
-        times = np.floor(due) if seed == 0 else np.sort(due + jitter)
-        shots = [Shot(Path(str(i)), float(at)) for i, at in enumerate(times)]
-        assert match_frames(shots, list(due)) == [shot.path for shot in shots]
-
-
-def test_match_frames__nothing_or_one():
-    assert match_frames([], [0.0, 1.0]) == [None, None]
-    assert match_frames([], []) == []
-    assert match_frames([Shot(Path("a"), 5.0)], [1.0]) == [Path("a")]
-
-
 def test_folder_cameras__need_their_folders(tmp_path):
     (tmp_path / "c0").mkdir()
     with pytest.raises(InputError, match="no subfolder c1; set the folders"):
@@ -234,7 +167,7 @@ def test_folder_cameras__need_their_folders(tmp_path):
     cameras.start()
     (tmp_path / "c0/half.png").write_bytes(b"\x89PNG")  # not complete yet
     (tmp_path / "c0/notes.txt").write_text("no frame")
-    assert cameras.collect(1, 10.0) == {"c0": []}
+    assert cameras.collect(1) == {"c0": []}
 
 
 def test_folder_cameras__files_may_be_renamed_while_they_are_listed(
@@ -249,4 +182,4 @@ def test_folder_cameras__files_may_be_renamed_while_they_are_listed(
     taken.write_bytes(imagecodecs.png_encode(np.zeros((2, 2, 3), np.uint16)))
     listed = Path.iterdir
     monkeypatch.setattr(Path, "iterdir", lambda path: iter([gone, *listed(path)]))
-    assert [shot.path for shot in cameras.collect(1, 10.0)["c0"]] == [taken]
+    assert [shot.path for shot in cameras.collect(1)["c0"]] == [taken]
