@@ -20,14 +20,7 @@ from .chromophores import (
     describe_chromophores,
     plot_chromophores,
 )
-from .components import (
-    condition_face_model,
-    face_at,
-    face_model,
-    plot_face_model,
-    sample_faces,
-    write_face_model,
-)
+from .components import plot_face_model
 from .correlations import (
     component_correlations,
     describe_correlations,
@@ -35,6 +28,8 @@ from .correlations import (
 )
 from .coverage import coverage_report, describe_coverage, plot_coverage
 from .edit import apply_traits, describe_edit
+from .face_files import write_face_model
+from .face_models import condition_face_model, face_at, face_model, sample_faces
 from .formula_models import describe_model, linear_model, plot_model
 from .groups import (
     describe_group_effects,

@@ -18,11 +18,10 @@ from skindb.analysis import (
 )
 from skindb.analysis.components import (
     describe_face_model,
-    face_maps,
-    face_vector,
     plot_face_model,
     tabulate_face_model,
 )
+from skindb.analysis.face_models import face_maps, face_vector
 from skindb.errors import InputError
 
 mpl.use("Agg")

@@ -23,7 +23,7 @@ from xarray import DataArray
 # the processes of takes import this module: nothing large
 import skindb
 from skindb import workflow
-from skindb.analysis.components import face_vector
+from skindb.analysis.face_models import face_vector
 from skindb.analysis.study import each_take
 from skindb.errors import Fault, InputError
 from skindb.workflow.takes import (
