@@ -240,7 +240,7 @@ def albedo_table(
 
 def decorrelate(colour: Array, mean: Array, axes: Array) -> Array:
     """Coordinates (n, 3) on the decorrelated axes."""
-    return np.asarray((colour - mean) @ axes.T)
+    return (colour - mean) @ axes.T
 
 
 def histogram(values: Array, area: Array, edges: Array) -> Array:
@@ -279,28 +279,26 @@ def plot_albedo(
     histograms: Dataset,
     *,
     table: Dataset | None = None,
-    axis: int = 0,
-    region: str = FACE,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot histograms of one decorrelated axis, one line per take, or per group of
-    `table` (from `albedo_table`).
+    """Plot histograms of the whole face along the first decorrelated axis, one line per
+    take, or per group of `table` (from `albedo_table`).
     """
     ax = ax or plots.new_axes(6, 3.6)
-    edges = histograms[variables.HISTOGRAM_EDGE].isel(axis=axis).values
+    edges = histograms[variables.HISTOGRAM_EDGE].isel(axis=0).values
     # bins that are joined for the plot; the full number is needed only for matching
     width = 8
     centres = edges[:-1].reshape(-1, width).mean(axis=1)
     if table is not None and table.attrs["group_by"]:
-        part = table.sel(region=region)
+        part = table.sel(region=FACE)
         counts = part[variables.GROUP_ALBEDO_COUNT].max("channel").values
         groups = zip(part["group"].values.tolist(), counts.tolist(), strict=True)
         names = [f"{name} (n = {n})" for name, n in groups]
-        lines = part[variables.GROUP_HISTOGRAM].isel(axis=axis).values
+        lines = part[variables.GROUP_HISTOGRAM].isel(axis=0).values
     else:
-        part = histograms.sel(region=region)
+        part = histograms.sel(region=FACE)
         names = part["take"].values.tolist()
-        lines = part[variables.ALBEDO_HISTOGRAM].isel(axis=axis).values
+        lines = part[variables.ALBEDO_HISTOGRAM].isel(axis=0).values
     has_legend = len(names) <= MAX_LEGEND_ENTRIES
     for i, (name, fractions) in enumerate(zip(names, lines, strict=True)):
         style: dict[str, Any] = {"color": "0.4", "linewidth": 0.5}
@@ -313,7 +311,7 @@ def plot_albedo(
         plots.legend_beside(ax)
     else:
         ax.set_title(f"{len(names)} takes", fontsize=8)
-    ax.set_xlabel(f"decorrelated colour, axis {axis} [standard deviations]")
+    ax.set_xlabel("decorrelated colour, axis 0 [standard deviations]")
     ax.set_ylabel("fraction of the area")
     ax.set_ylim(bottom=0)
     return ax

@@ -186,12 +186,10 @@ def _mean(take: Dataset) -> Array:
     weights = take[variables.DICTIONARY_WEIGHT].values
     area = take[variables.SURFEL_AREA].values
     good = finite_rows(weights)
-    return np.asarray(
-        np.average(
-            weights[good].astype(float),
-            axis=0,
-            weights=area[good].astype(float),
-        )
+    return np.average(
+        weights[good].astype(float),
+        axis=0,
+        weights=area[good].astype(float),
     )
 
 
@@ -205,7 +203,7 @@ def _fitted_weights(take: Dataset) -> Array:
     is padded with NaN.
     """
     weights = take[variables.DICTIONARY_WEIGHT].values
-    return np.asarray(weights[finite_rows(weights)].astype(float))
+    return weights[finite_rows(weights)].astype(float)
 
 
 def project(weights: Array, H: Array, metric: Array) -> Array:

@@ -452,7 +452,7 @@ def _published_axes(plane: _Plane) -> tuple[Array, str]:
 
 def _unmixed(density: Array, axes: Array, offset: Array) -> Array:
     """Amounts (..., 2) by least squares."""
-    return np.asarray((density - offset) @ np.linalg.pinv(axes))
+    return (density - offset) @ np.linalg.pinv(axes)
 
 
 def _statistics(

@@ -153,8 +153,7 @@ def _age_bands(ages: Array) -> Factor:
     decades = ages[(ages >= 0) & (ages <= MAX_AGE)] // DECADE
     span = range(int(decades.min()), int(decades.max()) + 1) if decades.size else []
     return {
-        f"{i * DECADE}-{i * DECADE + DECADE - 1}": np.asarray(ages // DECADE == i)
-        for i in span
+        f"{i * DECADE}-{i * DECADE + DECADE - 1}": ages // DECADE == i for i in span
     }
 
 

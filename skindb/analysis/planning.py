@@ -199,7 +199,7 @@ def _power(distance: Array, free: Array) -> Array:
         stats.nct.sf(limit, np.where(is_possible, free, 1), side * distance)
         for side in (1, -1)
     ]
-    return np.asarray(np.where(is_possible, np.sum(of_sides, axis=0), 0.0))
+    return np.where(is_possible, np.sum(of_sides, axis=0), 0.0)
 
 
 def tabulate_plan(table: Dataset) -> Table:

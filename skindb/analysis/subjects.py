@@ -82,7 +82,7 @@ class Attribute:
         except the first. NaN where the attribute is unknown.
         """
         if self.is_numeric:
-            return np.asarray(self.numbers - np.nanmean(self.numbers))[:, None]
+            return (self.numbers - np.nanmean(self.numbers))[:, None]
         columns = np.array(
             [[float(str(v) == word) for word in self.words[1:]] for v in self.values]
         ).reshape(len(self.values), -1)
@@ -412,7 +412,7 @@ def has_trait(subjects: Subjects, trait: str) -> Mask:
         ages = subjects.by_subject(AGE, subjects.names).numbers
         known = ages[np.isfinite(ages)]
         median = np.median(known) if known.size else np.inf
-        return np.asarray(subjects.attribute(AGE).numbers > median)
+        return subjects.attribute(AGE).numbers > median
     values = subjects.attribute(name).values
     return np.array([v == value if value else v is True for v in values], bool)
 
@@ -443,8 +443,8 @@ def comparable_takes(subjects: Subjects, trait: str) -> Mask:
     names = np.array(subjects.subject)
     paired = set(names[carries]) & set(names[plain])
     if not paired:
-        return np.asarray(carries | plain)
-    return np.asarray(np.isin(names, list(paired)) & (carries | plain))
+        return carries | plain
+    return np.isin(names, list(paired)) & (carries | plain)
 
 
 def subjects_without_normal(subjects: Subjects) -> list[Note]:

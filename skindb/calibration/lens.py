@@ -89,4 +89,4 @@ def _robust_fit(design: Float64, value: Float64) -> tuple[Float64, Float64, Mask
         spread = float(robust_deviation(residual[inliers]))
         limit = MAX_DEVIATIONS * max(spread, 1e-12 * abs(solution[0]))
         inliers = np.abs(residual) <= limit
-    return float64(solution), residual, np.asarray(inliers)
+    return float64(solution), residual, inliers

@@ -270,7 +270,7 @@ class ResponseSamples:
     @property
     def value(self) -> Float64:
         """Mean value (sample, exposure) of each block."""
-        return np.asarray(self.pixels.mean(axis=-1))
+        return self.pixels.mean(axis=-1)
 
 
 def response_samples(values: Float64, times: Float64) -> ResponseSamples:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
-from skindb.render.image import auto_exposure, encode_srgb, tone_map
+from skindb.render.image import auto_exposure, encode_srgb, shown_part, tone_map
 from skindb.render.photographs import Comparison, side_by_side
 from skindb.render.rendering import chosen_camera, radiance_of
 from skindb.render.scene import from_model
@@ -110,28 +110,20 @@ def crop_alike(pictures: Sequence[Picture], masks: Sequence[Mask]) -> list[Pictu
     (h, w), so that equal widths on the page correspond to equal scale. Without any face,
     pictures are not cropped.
     """
-    rows, cols = np.nonzero(np.any(masks, axis=0))
-    if not rows.size:
-        return list(pictures)
-    top = max(rows.min() - MARGIN, 0)
-    left = max(cols.min() - MARGIN, 0)
-    end = (slice(top, rows.max() + MARGIN + 1), slice(left, cols.max() + MARGIN + 1))
-    return [image[end] for image in pictures]
+    part = shown_part(masks, MARGIN)
+    return [image[part] for image in pictures]
 
 
 def predictions(comparisons: Sequence[Comparison], exposure: float) -> list[Picture]:
     """Photograph, prediction and difference of each comparison side by side, all at one
     exposure and one scale.
     """
-    drawn = list[Picture]()
-    masks = list[Mask]()
-    for comparison in comparisons:
-        width = comparison.mask.shape[1]
-        strip = side_by_side(comparison, exposure=exposure)
-        drawn += [strip[:, i * width : (i + 1) * width] for i in range(3)]
-        masks += [comparison.mask] * 3
-    cut = crop_alike(drawn, masks)
-    return [np.concatenate(cut[i : i + 3], axis=1) for i in range(0, len(cut), 3)]
+    part = shown_part([comparison.mask for comparison in comparisons], MARGIN)
+    strips = [side_by_side(comparison, exposure=exposure) for comparison in comparisons]
+    return [
+        np.concatenate([panel[part] for panel in np.split(strip, 3, axis=1)], axis=1)
+        for strip in strips
+    ]
 
 
 def _scaled(values: Image, top: float) -> Image:

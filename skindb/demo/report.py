@@ -4,21 +4,18 @@ its distance from the data.
 
 from __future__ import annotations
 
-import base64
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import imagecodecs
 import numpy as np
 import xarray as xr
 
 from skindb import __version__
 from skindb.analysis.studies import describe_study, plot_study, tabulate_study
 from skindb.demo.page import (
-    Picture,
     Portraits,
     draw_portraits,
     map_pictures,
@@ -26,6 +23,7 @@ from skindb.demo.page import (
     predictions,
 )
 from skindb.files import filled_template, make_private, private_file
+from skindb.render.image import image_url
 from skindb.render.photographs import Comparison, compare_images
 from skindb.schema import FitStatus, variables
 from skindb.types import Progress
@@ -216,12 +214,6 @@ def cell(value: Any) -> str:
     if np.isnan(value):
         return "-"
     return f"{value:.3g}" if -1000 < value < 1000 else f"{value:,.0f}"
-
-
-def image_url(image: Picture) -> str:
-    """An sRGB picture (rows, cols, 3) as an address that contains it."""
-    png = imagecodecs.png_encode(np.ascontiguousarray(image))
-    return f"data:image/png;base64,{base64.b64encode(png).decode()}"
 
 
 def _spaced(name: str) -> str:

@@ -13,7 +13,7 @@ import xarray as xr
 
 from skindb import __version__
 from skindb.export.inputs import describe_edit
-from skindb.export.textures import Shape, Skin, skin_of
+from skindb.export.textures import Shape, Skin, index_of, skin_of
 from skindb.files import private_file
 from skindb.schema.consent import require_consent
 
@@ -156,9 +156,8 @@ def _material(extras: dict[str, Any], skin: Skin) -> dict[str, Any]:
         "specularTexture": {"index": 2},
         "specularColorTexture": {"index": 3},
     }
-    root = np.sqrt(skin.top_f0)
     extensions = {
-        "KHR_materials_ior": {"ior": float((1 + root) / (1 - root))},
+        "KHR_materials_ior": {"ior": index_of(skin.top_f0)},
         "KHR_materials_specular": specular | {"specularColorFactor": [1.0, 1.0, 1.0]},
     }
     return {

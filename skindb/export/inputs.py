@@ -155,7 +155,7 @@ def mean_free_path(diffuse: Array, sigma_tr: Array, *, eta: float) -> Array:
         Refractive index of the skin.
     """
     s, _ = dipole_s(diffuse, eta=eta)
-    return np.asarray(
+    return (
         (MEAN_FREE_PATH_OFFSET + MEAN_FREE_PATH_PER_ALBEDO * float64(diffuse))
         * s
         / sigma_tr

@@ -9,7 +9,7 @@ import trimesh
 import xarray as xr
 
 from skindb import __version__
-from skindb.export.textures import Skin, unit_normals
+from skindb.export.textures import Skin, index_of, unit_normals
 from skindb.files import filled_template, make_private, private_file
 from skindb.render.image import write_png
 from skindb.schema import variables
@@ -67,11 +67,6 @@ def export_usd(
     for name, mesh in ((MATERIAL, {}), (STAGE, _mesh(model))):
         text = filled_template("skindb.export", f"usd/{name}.jinja", **material, **mesh)
         private_file(folder / name).write_text(text, encoding="utf-8")
-
-
-def index_of(f0: float) -> float:
-    """Index of refraction with this reflectance at normal incidence."""
-    return float((1 + np.sqrt(f0)) / (1 - np.sqrt(f0)))
 
 
 def _mesh(model: xr.DataTree) -> dict[str, str]:

@@ -4,6 +4,7 @@ error of the approximation.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +25,7 @@ from skindb.types import (
     Bytes,
     Float32,
     Float64,
+    dots,
     float64,
     lengths,
     unit,
@@ -38,6 +40,8 @@ MAX_F0 = 0.3  # reflectance at normal incidence, for an index of refraction of 3
 # of points without a highlight; the reflectance of the dielectric of glTF, index 1.5
 DEFAULT_F0 = 0.04
 ERROR_POINTS = 512  # surfels on which the approximation is compared with the model
+# of the triangle of (a, b) that glTF can represent, see `fit_material`
+CORNERS = np.array([[0, 0], [0, 1], [MAX_F0, 1 - MAX_F0]])
 MIN_F0 = 1e-3  # reflectance at normal incidence, for the index of refraction in files
 
 
@@ -72,6 +76,19 @@ class _Pairs:
             / np.pi
         )
         return np.column_stack([through, lookup(tables, *self.angles)])
+
+    @property
+    def rises(self) -> Array:
+        """1 and the term `rise` of Schlick (pairs, 2)."""
+        return np.stack([np.ones_like(self.cos_d), (1 - self.cos_d) ** 5], axis=1)
+
+    def product(self, first: Array, second: Array) -> Array:
+        """Inner products (a, b) of functions (pairs, a) and (pairs, b), as in a picture."""
+        return first.T @ ((self.weight * self.cos_i**2)[:, None] * second)
+
+    def gloss(self, roughness: float) -> Array:
+        """The lobe times `rises` (pairs, 2)."""
+        return self.lobe(roughness)[:, None] * self.rises
 
     def lobe(self, roughness: float | Array) -> Array:
         """GGX distribution with Smith's separable masking, divided by 4 cos_i cos_o (glTF
@@ -118,133 +135,94 @@ def fit_material(
     parts = pairs.parts(tables, eta)
     amounts = _amounts(diffuse, weights)
     base: Array = float64(diffuse)
-    low: Array
-    high: Array
-    roughness: Array
-    low = high = np.zeros(len(base))
-    roughness = np.full(len(base), 0.5)
     for _ in range(ROUNDS):
-        low, high, roughness = _fit_lobe(pairs, parts, amounts, base)
-        base = _fit_base(pairs, parts, amounts, low, high, roughness)
-    specular = low + high
-    f0 = np.where(specular > 0, low / np.where(specular > 0, specular, 1.0), DEFAULT_F0)
+        lobe, roughness = _fit_lobe(pairs, parts, amounts, base)
+        base = _fit_base(pairs, parts, amounts, lobe, roughness)
+    specular = lobe.sum(axis=1)
+    shines = specular > 0
+    f0 = np.where(shines, lobe[:, 0] / np.where(shines, specular, 1.0), DEFAULT_F0)
     return Material(base, specular, f0, roughness)
 
 
 def _fit_lobe(
     pairs: _Pairs, parts: Array, amounts: Array, base: Array
-) -> tuple[Array, Array, Array]:
-    """a, b and roughness (n,) for base colours (n, 3), where the model is `amounts` (3,
-    n, m) of `parts` (pairs, m).
+) -> tuple[Array, Array]:
+    """(a, b) (n, 2) and roughness (n,) for base colours (n, 3), where the model is
+    `amounts` (3, n, m) of `parts` (pairs, m).
     """
-    use = pairs.weight * pairs.cos_i**2
-    rise = (1 - pairs.cos_d) ** 5
-    matt = np.stack([np.ones_like(rise), rise], axis=1) / np.pi
-    of_matt = parts.T @ (use[:, None] * matt)
-    parameters = np.zeros((len(base), 3))
+    matt = pairs.rises / np.pi
+    # sums over the three channels, which share the lobe
+    colour = base.sum(axis=1)[:, None]
+    square = (base**2).sum(axis=1)[:, None]
+    of_matt = pairs.product(matt, matt)
+    of_model = (base.T[..., None] * amounts).sum(axis=0) @ pairs.product(parts, matt)
+    lobe = np.zeros((len(base), 2))
+    chosen = np.zeros(len(base))
     best = np.full(len(base), -np.inf)
     for roughness in ROUGHNESS:
-        gloss = pairs.lobe(roughness)[:, None] * matt * np.pi
-        squares = [
-            a.T @ (use[:, None] * b)
-            for a, b in ((gloss, gloss), (gloss, matt), (matt, matt))
-        ]
-        of_gloss = parts.T @ (use[:, None] * gloss)
-        flat_gloss = (matt[:, 0] * use) @ gloss
-        flat_matt = (matt[:, 0] * use) @ matt
-        gram = np.zeros((len(base), 2, 2))
-        rhs = np.zeros((len(base), 2))
-        for c in range(3):  # the three channels share the lobe
-            colour = base[:, c, None]
-            cross = squares[1] + squares[1].T
-            gram += (
-                squares[0]
-                - colour[..., None] * cross
-                + (colour**2)[..., None] * squares[2]
-            )
-            rhs += (
-                amounts[c] @ of_gloss
-                - colour * flat_gloss
-                - colour * (amounts[c] @ of_matt - colour * flat_matt)
-            )
+        gloss = pairs.gloss(roughness)
+        cross = pairs.product(gloss, matt)
+        gram = (
+            3 * pairs.product(gloss, gloss)
+            - colour[..., None] * (cross + cross.T)
+            + square[..., None] * of_matt
+        )
+        rhs = (
+            amounts.sum(axis=0) @ pairs.product(parts, gloss)
+            - colour * cross[:, 0]
+            - of_model
+            + square * of_matt[0]
+        )
         x, gain = _best_pair(gram, rhs)
         better = gain > best
         best[better] = gain[better]
-        parameters[better] = np.column_stack([x, np.full(len(x), roughness)])[better]
-    return parameters[:, 0], parameters[:, 1], parameters[:, 2]
+        lobe[better] = x[better]
+        chosen[better] = roughness
+    return lobe, chosen
 
 
 def _best_pair(gram: Array, rhs: Array) -> tuple[Array, Array]:
     """Pairs x >= 0 (n, 2) that minimise x G x - 2 x r, and the decrease (n,).
 
-    The constraints are that the sum of x is at most 1, and f0 at most MAX_F0.
+    The constraints are that the sum of x is at most 1, and f0 at most MAX_F0: x lies in
+    a triangle, inside it or on one of its sides.
     """
-    a = gram[:, 0, 0]
-    b = gram[:, 0, 1]
-    d = gram[:, 1, 1]
-    p, q = rhs.T
-    zero = np.zeros_like(p)
-    determinant = np.maximum(a * d - b * b, 1e-30)
-    slope = np.maximum(a - 2 * b + d, 1e-30)
-    # first element of x on the edge where the sum is 1
-    edge = np.clip((p - q - b + d) / slope, 0, MAX_F0)
-    ratio = (1 - MAX_F0) / MAX_F0  # second over first element of x where f0 is MAX_F0
-    ray = np.clip(
-        (p + ratio * q) / np.maximum(a + 2 * b * ratio + d * ratio**2, 1e-30), 0, MAX_F0
-    )
-    candidates = [
-        ((d * p - b * q) / determinant, (a * q - b * p) / determinant),
-        (ray, ratio * ray),
-        (zero, np.clip(q / np.maximum(d, 1e-30), 0, 1)),
-        (edge, 1 - edge),
-    ]
+    adjugate = gram[:, ::-1, ::-1] * [[1, -1], [-1, 1]]
+    determinant = gram[:, 0, 0] * gram[:, 1, 1] - gram[:, 0, 1] ** 2
+    inverse = adjugate / np.maximum(determinant, 1e-30)[:, None, None]
+    tried = [np.einsum("nij,nj->ni", inverse, rhs)]
+    for start, end in itertools.combinations(CORNERS, 2):
+        way = end - start
+        pull = gram @ way
+        steepness = np.maximum(pull @ way, 1e-30)
+        along = np.clip((rhs @ way - pull @ start) / steepness, 0, 1)
+        tried.append(start + along[:, None] * way)
     best = np.zeros_like(rhs)
-    gain = zero.copy()
-    for x, y in candidates:
-        fall = 2 * (x * p + y * q) - (a * x * x + 2 * b * x * y + d * y * y)
-        better = (
-            (x >= 0)
-            & (y >= ratio * x * (1 - 1e-9))
-            & (x + y <= 1 + 1e-9)
-            & (fall > gain)
-        )
+    gain = np.zeros(len(rhs))
+    for x in tried:
+        fall = dots(x, 2 * rhs - np.einsum("nij,nj->ni", gram, x))
+        total = x.sum(axis=1)
+        inside = (x[:, 0] >= 0) & (x[:, 0] <= MAX_F0 * total + 1e-9)
+        better = inside & (total <= 1 + 1e-9) & (fall > gain)
         gain[better] = fall[better]
-        best[better] = np.stack([x, y], axis=1)[better]
+        best[better] = x[better]
     return best, gain
 
 
 def _fit_base(
-    pairs: _Pairs,
-    parts: Array,
-    amounts: Array,
-    low: Array,
-    high: Array,
-    roughness: Array,
+    pairs: _Pairs, parts: Array, amounts: Array, lobe: Array, roughness: Array
 ) -> Array:
-    """Base colours (n, 3), from 0 to 1, for given lobes (n,)."""
-    use = pairs.weight * pairs.cos_i**2
-    rise = (1 - pairs.cos_d) ** 5
-    moment = [float((use * rise**i).sum()) / np.pi**2 for i in range(3)]
-    # 1 - F = constant + slope rise
-    constant = 1 - low
-    slope = -high
-    square = (
-        constant**2 * moment[0]
-        + 2 * constant * slope * moment[1]
-        + slope**2 * moment[2]
-    )
-    of_flat, of_rise = (
-        parts.T @ (use * factor) / np.pi for factor in (np.ones_like(rise), rise)
-    )
-    gloss = np.zeros((len(low), 3))
+    """Base colours (n, 3), from 0 to 1, for given lobes (n, 2)."""
+    matt = pairs.rises / np.pi
+    kept = [1.0, 0.0] - lobe  # factors of 1 and `rise` in 1 - F
+    square = np.einsum("ni,nj,ij->n", kept, kept, pairs.product(matt, matt))
+    shine = np.zeros(len(lobe))
     for value in np.unique(roughness):
-        lobe = pairs.lobe(value) * use / np.pi
-        gloss[roughness == value] = [float((lobe * rise**i).sum()) for i in range(3)]
-    shine = low * (constant * gloss[:, 0] + slope * gloss[:, 1]) + high * (
-        constant * gloss[:, 1] + slope * gloss[:, 2]
-    )
-    seen = constant * (amounts @ of_flat) + slope * (amounts @ of_rise) - shine
-    return np.asarray(np.clip(seen / np.maximum(square, 1e-12), 0, 1).T)
+        rows = roughness == value
+        both = pairs.product(matt, pairs.gloss(value))
+        shine[rows] = np.einsum("ni,nj,ij->n", kept[rows], lobe[rows], both)
+    seen = (amounts @ pairs.product(parts, matt) * kept).sum(axis=-1) - shine
+    return np.clip(seen / np.maximum(square, 1e-12), 0, 1).T
 
 
 def approximation_error(
@@ -295,11 +273,10 @@ def gltf_brdf(values: Material, pairs: _Pairs) -> Array:
     KHR_materials_specular.
     """
     f0 = values.f0[:, None]
-    rise = (1 - pairs.cos_d) ** 5
-    fresnel = values.specular[:, None] * (f0 + (1 - f0) * rise)
+    fresnel = values.specular[:, None] * (f0 + (1 - f0) * pairs.rises[:, 1])
     gloss = fresnel * pairs.lobe(values.roughness[:, None])
     matt = (1 - fresnel)[..., None] * values.base_color[:, None, :] / np.pi
-    return np.asarray(matt + gloss[..., None])
+    return matt + gloss[..., None]
 
 
 def _relative(ours: Array, theirs: Array, weight: Array) -> float:
@@ -461,3 +438,8 @@ def unit_normals(fitted: xr.Dataset, name: str) -> Float64:
     )
     length = lengths(normal)[..., None]
     return np.where(length > 1e-6, normal / np.maximum(length, 1e-6), [0.0, 0.0, 1.0])
+
+
+def index_of(f0: float) -> float:
+    """Index of refraction with this reflectance at normal incidence."""
+    return float((1 + np.sqrt(f0)) / (1 - np.sqrt(f0)))

@@ -48,6 +48,7 @@ from skindb.geometry.scan import Crop, Scan, crop_faces, read_scan
 from skindb.limits import MAX_FRAMES, MAX_OBJECT_KEYS, MAX_REGIONS, MAX_VISIT
 from skindb.parameters import SCAN_ERROR_DEGREES
 from skindb.schema.cohort import imitates_column, take_name
+from skindb.schema.consent import SCOPES
 from skindb.types import Float64, Index
 
 Point = Float64  # (3,) mm
@@ -57,7 +58,6 @@ OVERRIDE = ("screened", "consented", "eyes_closed")  # what the operator confirm
 # degrees
 MIN_SCAN_ERROR = 0.1
 MAX_SCAN_ERROR = 90.0
-SCOPES = ("fit", "statistics", "export", "publish")
 WHOLE_SURFACE = "all"  # name of the entire surface in reports by region
 _NONE = np.zeros(0, np.int64)
 NO_SCAN = Scan(np.zeros((0, 3)), np.zeros((0, 3), np.int64))

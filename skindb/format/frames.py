@@ -38,7 +38,7 @@ from skindb.limits import (
     MAX_PNG_RATIO,
     MAX_RECHECKED_BYTES,
 )
-from skindb.render.image import write_exr
+from skindb.render.image import write_exr, write_png
 from skindb.types import AnyArray, Index, Values16
 
 Frame = AnyArray  # (h, w, 3) uint8, uint16, float16 or float32
@@ -256,8 +256,7 @@ def write_frame(path: Path, frame: Frame) -> None:
     if suffix == ".exr":
         write_exr(path, frame)
     elif suffix == ".png":
-        content = imagecodecs.png_encode(np.ascontiguousarray(frame))
-        private_file(path).write_bytes(content)
+        write_png(path, frame)
     elif suffix in (".tif", ".tiff"):
         tifffile.imwrite(
             private_file(path), frame, photometric="rgb", compression="zstd"

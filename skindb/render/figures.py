@@ -13,7 +13,7 @@ from skindb.errors import input_error
 from skindb.files import private_file
 from skindb.geometry.mesh import face_crosses
 from skindb.geometry.rays import RayScene
-from skindb.render.image import encode_srgb
+from skindb.render.image import encode_srgb, shown_part
 from skindb.schema import variables
 from skindb.schema.consent import honour_consent
 from skindb.types import Array, Faces, Float64, Index, lengths
@@ -411,7 +411,8 @@ def write_grid(
 
     pictures = [image for row in rows.values() for image in row]
     gain = auto_exposure(pictures[0]) if exposure is None else exposure
-    crop = _lit(pictures)
+    lit = [np.nan_to_num(image).max(axis=2) > 0 for image in pictures]
+    crop = shown_part(lit, GRID_MARGIN_PX)
     height, width = pictures[0][crop].shape[:2]
     size = np.array([width, height]) * (CELL + GAP) / max(height, width)
     figure, axes = pyplot.subplots(
@@ -436,16 +437,3 @@ def write_grid(
         bbox_inches="tight",
     )
     pyplot.close(figure)
-
-
-def _lit(images: Sequence[Array]) -> tuple[slice, slice]:
-    """Rows and columns of the part where any of the pictures is above zero."""
-    lit = np.any([np.nan_to_num(image).max(axis=2) > 0 for image in images], axis=0)
-    if not lit.any():
-        return slice(None), slice(None)
-    ranges = []
-    for axis in (1, 0):
-        places = np.flatnonzero(lit.any(axis=axis))
-        begin = max(int(places[0]) - GRID_MARGIN_PX, 0)
-        ranges.append(slice(begin, int(places[-1]) + 1 + GRID_MARGIN_PX))
-    return ranges[0], ranges[1]

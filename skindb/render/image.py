@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import base64
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import imagecodecs
@@ -78,6 +79,22 @@ def write_png(path: str | Path, picture: AnyArray) -> None:
     private_file(path).write_bytes(
         imagecodecs.png_encode(np.ascontiguousarray(picture))
     )
+
+
+def image_url(picture: Bytes) -> str:
+    """An sRGB picture (h, w, 3) as an address that contains it."""
+    png = imagecodecs.png_encode(np.ascontiguousarray(picture))
+    return f"data:image/png;base64,{base64.b64encode(png).decode()}"
+
+
+def shown_part(masks: Sequence[Mask], margin: int) -> tuple[slice, slice]:
+    """Rows and columns around the pixels of any mask (h, w); all if no mask has one."""
+    places = np.argwhere(np.any(masks, axis=0))
+    if not len(places):
+        return slice(None), slice(None)
+    top, left = np.maximum(places.min(axis=0) - margin, 0).tolist()
+    bottom, right = (places.max(axis=0) + margin + 1).tolist()
+    return slice(top, bottom), slice(left, right)
 
 
 def write_exr(

@@ -275,8 +275,7 @@ def _brdfs(
     cosine = dots(points.normal, to_light)[:, None]
     seen = dots(points.normal, points.view)[:, None]
     above = (cosine > 0) & (seen > 0)
-    f_r = np.divide(radiance, cosine, out=np.zeros(radiance.shape), where=above)
-    return np.asarray(f_r)
+    return np.divide(radiance, cosine, out=np.zeros(radiance.shape), where=above)
 
 
 def _points(fitted: xr.Dataset, surface: ReflectanceModel, to_camera: Array) -> Points:

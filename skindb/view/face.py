@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-import imagecodecs
 import numpy as np
 import xarray as xr
 from sklearn.cluster import KMeans
@@ -18,7 +17,7 @@ from skindb.geometry.mesh import vertex_areas
 from skindb.optics.diffusion import S_FLOOR
 from skindb.optics.fresnel import boundary_factor
 from skindb.reflectance.model import MAX_TABLES
-from skindb.render.image import tone_map
+from skindb.render.image import image_url, tone_map
 from skindb.render.monte_carlo import Lighting
 from skindb.render.rendering import chosen_camera, chosen_lights, fixed_exposure, render
 from skindb.render.scene import LUMINANCE, Environment, Surface, from_model
@@ -231,8 +230,7 @@ def still_picture(model: xr.DataTree) -> str:
     scale = min(1.0, MAX_STILL_SIDE / max(camera.width, camera.height))
     seen = render(model, samples=STILL_SAMPLES, scale=scale)
     gain = fixed_exposure(Lighting(chosen_lights(dome, ())[0]), camera)
-    png = imagecodecs.png_encode(tone_map(seen["radiance"].values, exposure=gain))
-    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
+    return image_url(tone_map(seen["radiance"].values, exposure=gain))
 
 
 def diffusion_width(s: Array, eta: float) -> Array:
@@ -256,7 +254,7 @@ def diffusion_width(s: Array, eta: float) -> Array:
     # exp(-z), in units of 1 / sigma_tr
     power = (np.exp(-depth) + np.exp(-above)) / 2
     square = depth * np.exp(-depth) + above * np.exp(-above)
-    return np.asarray(np.sqrt(square / power / 2))
+    return np.sqrt(square / power / 2)
 
 
 def uv_spacing(vertices: Array, faces: Faces, uv: Array) -> Array:
@@ -265,7 +263,7 @@ def uv_spacing(vertices: Array, faces: Faces, uv: Array) -> Array:
     square = vertex_areas(vertices, faces) / np.maximum(
         vertex_areas(flat.astype(float), faces), 1e-12
     )
-    return np.asarray(np.sqrt(np.clip(square, 1e-6, 1e12)))
+    return np.sqrt(np.clip(square, 1e-6, 1e12))
 
 
 def _values(surface: Surface, mixed: Array) -> dict[str, Array]:

@@ -204,4 +204,4 @@ def _shown(values: Float64) -> Float64:
     """Values of a display: a square root, so that the brightest hundredth is bright."""
     finite = values[np.isfinite(values)]
     bright = float(np.quantile(finite, 0.99)) if finite.size else 1.0
-    return np.asarray(np.sqrt(np.maximum(values, 0) / max(bright, 1e-9)) * BRIGHT)
+    return np.sqrt(np.maximum(values, 0) / max(bright, 1e-9)) * BRIGHT
