@@ -654,7 +654,7 @@ def test_suspect_line__says_what_and_asks_why():
 
     light = _suspect_line({"light": "l017", "outlier_fraction": 0.624, "misfit": 2.54})
     assert light == (
-        "  light l017: 62% of its samples are outliers, residuals 2.5 times noise "
+        "light l017: 62% of its samples are outliers, residuals 2.5 times noise "
         "(did the face move?)"
     )
     assert "camera c03: 11% " in _suspect_line(
@@ -848,7 +848,7 @@ def test_fit_lines__gains_translucency_and_a_model_that_explains_no_photographs(
     }
     with click.Context(click.Command("fit")) as context:
         context.meta["verbose"] = False
-        lines = _fit_lines("A", report)
+        lines = _fit_lines(report)
     assert (
         any(
             "does not explain the photographs: check the camera poses" in line
@@ -857,10 +857,10 @@ def test_fit_lines__gains_translucency_and_a_model_that_explains_no_photographs(
         is said
     )
     assert (
-        "  sigma_tr of cheek: R 0.5 +- 0.1, G 0.7 +- 0.1, B unknown mm-1 (fitted, dark)"
+        "sigma_tr of cheek: R 0.5 +- 0.1, G 0.7 +- 0.1, B unknown mm-1 (fitted, dark)"
         in lines
     )
     assert (
-        "  gains of the lights: standard deviation 2.0%; the farthest from 1 is 1.10, of "
+        "gains of the lights: standard deviation 2.0%; the farthest from 1 is 1.10, of "
         "light l003"
     ) in lines

@@ -113,8 +113,8 @@ class Attribute:
             if len(same) > 1:
                 alike = " and ".join(map(repr, sorted(same)))
                 notes.append(f"{self.name}: {alike} count as different values")
-        ages = [value for value in self.known if self.name == AGE and _is_finite(value)]
-        odd = sorted({str(a) for a in ages if not 0 <= float(str(a)) <= MAX_AGE})
+        ages = self.numbers[np.isfinite(self.numbers)] if self.name == AGE else []
+        odd = sorted({f"{age:g}" for age in ages if not 0 <= age <= MAX_AGE})
         if odd:
             examples = ", ".join(odd[:3])
             rule = f"must be in years, from 0 to {MAX_AGE}"
@@ -521,10 +521,6 @@ def _parsed(value: object) -> Value:
 
 def _is_number(value: Value) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _is_finite(value: Value) -> bool:
-    return _is_number(value) and math.isfinite(float(str(value)))
 
 
 def _reads_as_number(text: str) -> bool:

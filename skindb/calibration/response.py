@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from skindb.errors import require
 from skindb.numerics.statistics import robust_deviation
-from skindb.types import Float64, Index, Mask
+from skindb.types import Float64, Mask
 
 STACK = "the exposure stack"
 # value at which the knots change from even steps to even ratios: below it sensors and
@@ -299,20 +299,14 @@ def response_samples(values: Float64, times: Float64) -> ResponseSamples:
     usable = usable[enough]
     roughness = tiles.std(axis=-1) / np.maximum(mean, MIN_VALUE)
     rough = np.where(usable, roughness, 0).max(axis=1, initial=0)
-    order = _flattest_first(rough, np.clip(mean, 0, 1).mean(axis=1))
-    chosen = order[:SAMPLES]
-    return ResponseSamples(tiles[chosen], usable[chosen], times)
-
-
-def _flattest_first(rough: Float64, bright: Float64) -> Index:
-    """Order of blocks (n,): the flattest of each class of brightness, the second
-    flattest of each, and so on.
-    """
+    # the flattest of each class of brightness, the second flattest of each, and so on
+    bright = np.clip(mean, 0, 1).mean(axis=1)
     low, high = (bright.min(), bright.max()) if len(bright) else (0.0, 1.0)
     relative = (bright - low) / max(high - low, 1e-12)
     stratum = np.minimum((relative * STRATA).astype(int), STRATA - 1)
     rank = pd.Series(rough).groupby(stratum).rank("first")
-    return np.lexsort((stratum, rank))
+    chosen = np.lexsort((stratum, rank))[:SAMPLES]
+    return ResponseSamples(tiles[chosen], usable[chosen], times)
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from skindb.cli.shared import (
     choice_lines,
     each_take,
     emit,
+    indented,
     shared_path,
     summary_of,
 )
@@ -131,12 +132,13 @@ def simulate(
         paper=paper,
         progress=progress,
     )
-    results, faults = each_take(call, numbers, progress=progress, finish=_simulated)
+    results, faults = each_take(
+        call,
+        numbers,
+        progress=progress,
+        finish=lambda take: (f"{take[0]:04d}", str(take[1]), [str(take[1])]),
+    )
     emit([results[name] for name in sorted(results)], [], faults)
-
-
-def _simulated(simulated: tuple[int, Path]) -> tuple[str, Any, list[str]]:
-    return f"{simulated[0]:04d}", str(simulated[1]), [str(simulated[1])]
 
 
 @command
@@ -230,31 +232,25 @@ def _ingested(
         return record.take, summary_of(record), [line]
     if keys := record.provenance["unknown_keys"]:
         echo(
-            (
-                f"{record.take}: warning: unknown keys of capture.json, kept but not "
-                f"read: {', '.join(keys)}"
-            ),
+            f"{record.take}: warning: unknown keys of capture.json, kept but not "
+            f"read: {', '.join(keys)}",
             err=True,
         )
     summary = summary_of(record)
     figures = summary.get("summary", {})
-    lines = [f"{record.take}: capture {summary['generation']}, {summary['path']}"]
+    lines = []
     if surfels := figures.get("surfels"):
         spacing = f"{surfels['spacing_mm']:.2g} mm apart"
-        lines.append(f"  {surfels['count']:,} surfels, {spacing}")
-    lines += [f"  {line}" for line in calibrated_by_lines(record.provenance)]
+        lines.append(f"{surfels['count']:,} surfels, {spacing}")
+    lines += calibrated_by_lines(record.provenance)
     if "samples" in figures:
-        lines += [
-            f"  {line}" for line in skindb.ingest.sample_lines(figures["samples"])
-        ]
-    lines += [f"  {line}" for line in choice_lines(figures.get("corrections", {}))]
+        lines += skindb.ingest.sample_lines(figures["samples"])
+    lines += choice_lines(figures.get("corrections", {}))
     if asked("verbose"):
-        lines += [f"  {line}" for line in calibration_lines(database, record.take)]
-    lines += [f"  note: {line}" for line in figures.get("notes", [])]
-    lines += [f"  skipped: {line}" for line in summary.get("skipped", [])]
+        lines += calibration_lines(database, record.take)
+    lines += [f"note: {line}" for line in figures.get("notes", [])]
+    lines += [f"skipped: {line}" for line in summary.get("skipped", [])]
     if explain:
-        lines += [
-            f"  {line}"
-            for line in skindb.ingest.cleaning_lines(summary, places=asked("verbose"))
-        ]
-    return record.take, summary, lines
+        lines += skindb.ingest.cleaning_lines(summary, places=asked("verbose"))
+    title = f"{record.take}: capture {summary['generation']}, {summary['path']}"
+    return record.take, summary, [title, *indented(lines)]

@@ -29,6 +29,7 @@ from skindb.cli.shared import (
     each_take,
     emit,
     existing,
+    indented,
     shared_path,
     summary_of,
 )
@@ -143,77 +144,64 @@ def _finished(
     tables = database.tables(result)
     prediction = skindb.fit.describe_prediction(tables)
     report = {**result.provenance, **summary_of(result), "prediction": prediction}
-    lines = _fit_lines(result.take, report)
+    lines = _fit_lines(report)
     if asked("verbose"):
-        diffuse = aligned(skindb.fit.tabulate_diffuse(tables))
-        lines += [f"  {line}" for line in diffuse]
-    return result.take, report, lines
-
-
-def _fit_lines(take: str, report: Json) -> list[str]:
-    total = sum(report["seconds"].values())
+        lines += aligned(skindb.fit.tabulate_diffuse(tables))
     status = ", ".join(
         f"{fraction:.1%} {name}" for name, fraction in report["status"].items()
     )
-    lines = [
-        (
-            f"{take}: model {report['generation']}, {report['surfels']} surfels in "
-            f"{total:.1f} s: {status}"
-        )
-    ]
+    title = (
+        f"{result.take}: model {report['generation']}, {report['surfels']} surfels in "
+        f"{sum(report['seconds'].values()):.1f} s: {status}"
+    )
+    return result.take, report, [title, *indented(lines)]
+
+
+def _fit_lines(report: Json) -> list[str]:
+    lines = []
     if report["status"].get("fitted", 0) < MIN_FITTED_FRACTION:
         lines.append(
-            "  few surfels are fitted, and the errors below refer only to them; "
+            "few surfels are fitted, and the errors below refer only to them; "
             "draw fit_status with skindb show"
         )
     names = ("fit_residual", "held_out_error", "held_out_camera_error")
     errors = {name: report[name] for name in names if name in report}
     lines += [
-        f"  {n.replace('_', ' ')}: median {v['median']:.1%}, 95 % {v['p95']:.1%}"
+        f"{n.replace('_', ' ')}: median {v['median']:.1%}, 95 % {v['p95']:.1%}"
         for n, v in errors.items()
     ]
     if report.get("fit_residual", {}).get("median", 0) > MAX_RESIDUAL:
         lines.append(
-            "  the model does not explain the photographs: check the camera poses, "
+            "the model does not explain the photographs: check the camera poses, "
             "exposure seconds, response and "
             "positions of the lights before anything else"
         )
-    lines += [f"  dictionary, {line}" for line in report.get("dictionary_notes", [])]
+    lines += [f"dictionary, {line}" for line in report.get("dictionary_notes", [])]
     lines += [
         _site_line(site, entry)
         for site, entry in report.get("translucency", {}).items()
     ]
     lines += [_suspect_line(entry) for entry in report["suspects"]]
-    lines += _energy_lines(report.get("surface_energy", {}))
-    lines += [f"  {line}" for line in choice_lines(report.get("corrections", {}))]
+    if (energy := report.get("surface_energy", {})).get("contradicted"):
+        lines.append(
+            f"the highlights reflect {energy['highlights']:.3f} of the light, but the "
+            f"surface should reflect {energy['mean']:.3f} with a standard deviation of "
+            f"{energy['error']:.3f} in this condition: even reflection stays in R_d; if "
+            "you know more, state --surface-energy"
+        )
+    lines += choice_lines(report.get("corrections", {}))
     if gains := report.get("light_gains"):
         lines.append(
-            f"  gains of the lights: standard deviation {gains['spread']:.1%}; "
+            f"gains of the lights: standard deviation {gains['spread']:.1%}; "
             f"the farthest from 1 is {gains['gain']:.2f}, of light {gains['light']}"
         )
-    lines += [f"  skipped: {line}" for line in report["skipped"]]
+    lines += [f"skipped: {line}" for line in report["skipped"]]
     if asked("verbose"):
+        lines += aligned(skindb.fit.tabulate_prediction(report["prediction"]))
         lines += [
-            f"  {line}"
-            for line in aligned(skindb.fit.tabulate_prediction(report["prediction"]))
-        ]
-        lines += [
-            f"  {stage}: {seconds:.1f} s"
-            for stage, seconds in report["seconds"].items()
+            f"{stage}: {seconds:.1f} s" for stage, seconds in report["seconds"].items()
         ]
     return lines
-
-
-def _energy_lines(energy: Json) -> list[str]:
-    """A line if the highlights reflect more than the prior of the surface allows."""
-    if not energy.get("contradicted"):
-        return []
-    return [
-        f"  the highlights reflect {energy['highlights']:.3f} of the light, but the surface "
-        f"should reflect {energy['mean']:.3f} with a standard deviation of "
-        f"{energy['error']:.3f} in this condition: even reflection stays in R_d; if "
-        "you know more, state --surface-energy"
-    ]
 
 
 def _site_line(site: str, result: Json) -> str:
@@ -224,7 +212,7 @@ def _site_line(site: str, result: Json) -> str:
         for c, v, e in values
     )
     statuses = ", ".join(dict.fromkeys(result["status"]))
-    return f"  sigma_tr of {site}: {channels} mm-1 ({statuses})"
+    return f"sigma_tr of {site}: {channels} mm-1 ({statuses})"
 
 
 def _suspect_line(suspect: Json) -> str:
@@ -236,7 +224,7 @@ def _suspect_line(suspect: Json) -> str:
     fraction = suspect["outlier_fraction"]
     misfit = suspect["misfit"]
     return (
-        f"  {device} {suspect[device]}: {fraction:.0%} of its samples are outliers, residuals "
+        f"{device} {suspect[device]}: {fraction:.0%} of its samples are outliers, residuals "
         f"{misfit:.1f} times noise ({question})"
     )
 

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 import skindb
 from skindb import workflow
 from skindb.cli.options import DB, PATH, PORT, command, options_of
-from skindb.cli.shared import emit, existing, serve, writable
+from skindb.cli.shared import emit, existing, indented, serve, writable
 from skindb.cli.terminal import bar, wait_for_enter
 from skindb.files import Json
 from skindb.parameters import CalibrationParameters, SessionParameters
-
-if TYPE_CHECKING:
-    from skindb.store import Record
 
 
 @command
@@ -119,75 +115,74 @@ def calibrate(
             database, sources, name=parameters.name, progress=bar()
         )
         report = workflow.describe_rig(database, record)
-        lines = _rig_lines(record, report)
+        lines = _rig_lines(report)
     else:
         if len(sources) != 1:
             raise click.UsageError("give one SETUP, or --from-takes")
         database = skindb.open(db)
         record = workflow.calibrate(database, sources[0], **vars(parameters))
         report = workflow.describe_calibration(database, record)
-        lines = _calibration_lines(record, report)
+        lines = _calibration_lines(report)
     if report["ingest_again"]:
         earlier = ", ".join(report["ingest_again"])
         lines.append(
-            f"  captures without this calibration, which should be ingested again: {earlier}"
+            f"captures without this calibration, which should be ingested again: {earlier}"
         )
     summary = {
         "calibration": record.take,
         "generation": record.generation,
         "path": record.path,
     }
-    emit(summary | report, lines)
+    source = f" from {len(report['takes'])} takes" if from_takes else ""
+    title = (
+        f"{record.take}: calibration {record.generation} of {report['lights']} lights"
+        f"{source}, {record.path}"
+    )
+    emit(summary | report, [title, *indented(lines)])
 
 
-def _rig_lines(record: Record, report: Json) -> list[str]:
+def _rig_lines(report: Json) -> list[str]:
     """What a calibration from takes found, one line each."""
     misfit = report["misfit"]
     lines = [
-        f"{record.take}: calibration {record.generation} of {report['lights']} lights "
-        f"from {len(report['takes'])} takes, {record.path}",
-        f"  spread of the lights in a held-out take: {report['spread']:.1%} "
+        f"spread of the lights in a held-out take: {report['spread']:.1%} "
         f"without and {report['spread_left']:.1%} with the gains of the others (medians)",
-        f"  gains are known to {report['largest_relative_error']:.2%} or better, relative "
+        f"gains are known to {report['largest_relative_error']:.2%} or better, relative "
         "to each other"
         if report["light_gains"]
-        else "  intensities are left as stated",
-        "  residuals of a held-out take with the gains of the others: "
+        else "intensities are left as stated",
+        "residuals of a held-out take with the gains of the others: "
         f"{misfit['gains']:.0%} of those without; with their directions, too: "
         f"{misfit['gains and offsets']:.0%}",
-        f"  directions are moved by {report['angle']:.1f} degrees (rms), known to "
+        f"directions are moved by {report['angle']:.1f} degrees (rms), known to "
         f"{report['largest_angle_error']:.1f} or better, relative to each other"
         if report["angle"]
-        else "  directions are left as stated",
+        else "directions are left as stated",
     ]
     if report["camera_gains"]:
         lines.append(
-            f"  spread of the cameras in a held-out take: {report['camera_spread']:.1%} "
+            f"spread of the cameras in a held-out take: {report['camera_spread']:.1%} "
             f"without and {report['camera_spread_left']:.1%} with the gains of the others"
         )
     elif report["cameras"] > 1:
-        lines.append("  cameras are left as stated")
+        lines.append("cameras are left as stated")
     if report["lobes"]:
-        lines.append("  captures with few samples may share the lobes of these takes")
+        lines.append("captures with few samples may share the lobes of these takes")
     if few := report["without_gain"]:
-        lines.append(f"  gain 1, as fewer than three takes show them: {', '.join(few)}")
+        lines.append(f"gain 1, as fewer than three takes show them: {', '.join(few)}")
     return lines
 
 
-def _calibration_lines(record: Record, report: Json) -> list[str]:
+def _calibration_lines(report: Json) -> list[str]:
     """What a calibration found, one line each."""
-    lines = [
-        f"{record.take}: calibration {record.generation} of {report['lights']} lights, "
-        f"{record.path}"
-    ]
-    lines += [f"  {line}" for line in _camera_lines(report.get("cameras", {}))]
+    lines = _camera_lines(report.get("cameras", {}))
     if "largest_position_error_mm" in report:
         lines.append(
-            "  positions of the lights: standard error at most "
+            "positions of the lights: standard error at most "
             f"{report['largest_position_error_mm']:.2f} mm"
         )
     lines.append(
-        f"  intensities are known to {report['total_relative_error']:.2%} or better: noise at most "
+        f"intensities are known to {report['total_relative_error']:.2%} or better: noise at most "
         f"{report['largest_relative_error']:.2%}, positions "
         f"{report['position_error']:.2%} and light beside the target "
         f"{report['glare']:.2%} (medians)"
@@ -195,7 +190,7 @@ def _calibration_lines(record: Record, report: Json) -> list[str]:
     if "probe" in report:
         gains = report["probe"]["largest_relative_error"]
         lines.append(
-            f"  gains of {report['probe']['fibres']} fibres: known to {gains:.2%} or better"
+            f"gains of {report['probe']['fibres']} fibres: known to {gains:.2%} or better"
         )
     return lines
 

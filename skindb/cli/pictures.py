@@ -91,12 +91,7 @@ def render(
     )
     finish = partial(_rendered, explain=request["explain"], error=parameters.error)
     with workflow.logged_action(database, "render", chosen, arguments=request):
-        results, faults = each_take(
-            call,
-            chosen,
-            progress=bar(),
-            finish=finish,
-        )
+        results, faults = each_take(call, chosen, progress=bar(), finish=finish)
     emit(results, [], faults)
 
 
@@ -146,25 +141,12 @@ def compare(
     )
     if out:
         skindb.render.write_comparisons(comparisons, out)
+    stated = ["light", "camera", "held_out"]
     result = [
-        {
-            "light": c.light,
-            "camera": c.camera,
-            "held_out": c.held_out,
-            **c.error,
-            "filled": c.filled,
-        }
+        {name: getattr(c, name) for name in stated} | c.error | {"filled": c.filled}
         for c in comparisons
     ]
-    header = [
-        "light",
-        "camera",
-        "held_out",
-        "relative_rmse",
-        "psnr",
-        "ssim",
-        "delta_e_median",
-    ]
+    header = [*stated, "relative_rmse", "psnr", "ssim", "delta_e_median"]
     rows = [[row[name] for name in header] for row in result]
     emit(result, aligned([header, *rows]))
 
@@ -246,13 +228,9 @@ def export(
             call,
             chosen,
             progress=progress,
-            finish=_exported,
+            finish=lambda path: (path.name, str(path), [str(path)]),
         )
     emit(results, [], faults)
-
-
-def _exported(path: Path) -> tuple[str, Any, list[str]]:
-    return path.name, str(path), [str(path)]
 
 
 def _label(text: str) -> tuple[str, str]:

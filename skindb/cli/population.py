@@ -25,6 +25,7 @@ from skindb.cli.shared import (
     cluster,
     emit,
     existing,
+    indented,
     trait_amounts,
     writable,
 )
@@ -163,17 +164,15 @@ def _distance(tree: DataTree) -> str:
 def _report_edit(record: Record, tree: DataTree) -> None:
     """Print the report of an edit that was stored."""
     takes = tree.attrs["study_takes"]
-    lines = [
-        f"{record.take}: edit {record.generation}; {_distance(tree)}",
-        f"  traits from the study of {len(takes)} takes: {few_names(takes)}",
-    ]
+    title = f"{record.take}: edit {record.generation}; {_distance(tree)}"
+    source = f"traits from the study of {len(takes)} takes: {few_names(takes)}"
     summary = {
         "generation": record.generation,
         "path": record.path,
         "edit_distance": float(tree.attrs["edit_distance"]),
         "edit_report": dict(tree.attrs["edit_report"]),
     }
-    emit(summary, [*lines, *(f"  {line}" for line in _edit_notes(tree))])
+    emit(summary, [title, *indented([source, *_edit_notes(tree)])])
 
 
 def _edit_notes(tree: DataTree) -> list[str]:

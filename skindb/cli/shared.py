@@ -118,6 +118,11 @@ def aligned(rows: list[list[Any]]) -> list[str]:
     ]
 
 
+def indented(lines: Iterable[str]) -> list[str]:
+    """Lines below the one of a take or calibration."""
+    return [f"  {line}" for line in lines]
+
+
 def each_take(
     function: Callable[[T], R],
     takes: Sequence[T],
@@ -180,14 +185,10 @@ def _finished(
     if outcome.traceback and asked("verbose"):
         echo(*outcome.traceback.splitlines(), err=True)
     faults = dict.fromkeys(workflow.faults_of(outcome))
-    return name, [_placed(fault, name) for fault in faults]
-
-
-def _placed(fault: Fault, item: str) -> Fault:
-    """The fault with the name of its capture or take, if it does not contain it."""
-    return (
-        fault if item in fault.where else replace(fault, where=f"{item}: {fault.where}")
-    )
+    return name, [
+        fault if name in fault.where else replace(fault, where=f"{name}: {fault.where}")
+        for fault in faults
+    ]
 
 
 def fault_lines(faults: Iterable[Fault], *, unlimited: bool) -> list[str]:

@@ -20,12 +20,13 @@ from skindb.cli.shared import (
     choice_lines,
     emit,
     existing,
+    indented,
 )
 from skindb.errors import InputError, input_error
 from skindb.files import Json
 
 if TYPE_CHECKING:
-    from skindb.store import BackupReport, Database, Garbage, Restored
+    from skindb.store import BackupReport, Database, Restored
 
 
 @command
@@ -85,18 +86,14 @@ def _info_lines(database: Database, result: Json, *, details: bool) -> list[str]
                 f"{version['generation']:3d}  {version['bytes'] / 1e6:8.1f} MB  "
                 f"{version['created']}  {version['path']}"
             )
-            text += (
-                f"  {', '.join(version['scope']) or 'none'}"
-                if "scope" in version
-                else ""
-            )
-            text += (
-                f"  out of date: {version['stale'][0]}" if version.get("stale") else ""
-            )
+            if "scope" in version:
+                text += f"  {', '.join(version['scope']) or 'none'}"
+            if version.get("stale"):
+                text += f"  out of date: {version['stale'][0]}"
             lines.append(f"{take:<16} {kind:<10} {text}")
-            lines += [f"  {line}" for line in calibrated_by_lines(version)]
+            lines += indented(calibrated_by_lines(version))
             if kind in DETAILS and "fault" not in version and details:
-                lines += [f"  {line}" for line in _details(database, kind, take)]
+                lines += indented(_details(database, kind, take))
     return lines
 
 
@@ -148,9 +145,9 @@ def _prediction_lines(database: Database, take: str) -> list[str]:
 
 def _capture_lines(database: Database, take: str) -> list[str]:
     summary = database.record("capture", take).provenance.get("summary", {})
-    parts = (_sample_lines, calibration_lines)
     return [
-        *[line for part in parts for line in part(database, take)],
+        *_sample_lines(database, take),
+        *calibration_lines(database, take),
         *choice_lines(summary.get("corrections", {})),
     ]
 
@@ -234,7 +231,11 @@ def clean(db: str, generations: int | None, yes: bool) -> None:
     going = [item for item in garbage if not item.kept]
     remaining = [item for item in garbage if item.kept]
     total = sum(item.bytes for item in going)
-    lines = [_garbage_line(item) for item in [*going, *remaining]]
+    lines = [
+        f"{item.key}  {item.bytes / 1e6:.1f} MB  {item.what}"
+        + (f"  (kept: {item.kept})" if item.kept else "")
+        for item in [*going, *remaining]
+    ]
     lines.append(
         f"{len(going)} removed, {total / 1e6:.1f} MB"
         if yes
@@ -244,12 +245,6 @@ def clean(db: str, generations: int | None, yes: bool) -> None:
     emit(
         {"removed": yes, "bytes": total, "items": [asdict(item) for item in garbage]},
         lines,
-    )
-
-
-def _garbage_line(item: Garbage) -> str:
-    return f"{item.key}  {item.bytes / 1e6:.1f} MB  {item.what}" + (
-        f"  (kept: {item.kept})" if item.kept else ""
     )
 
 
@@ -346,10 +341,8 @@ def restore(
 
 def _restored_lines(restored: Restored, without_markers: bool) -> list[str]:
     lines = [
-        (
-            f"state {restored.number} of {restored.created}: {restored.versions} versions, "
-            f"{restored.bytes / 1e6:.1f} MB"
-        )
+        f"state {restored.number} of {restored.created}: {restored.versions} versions, "
+        f"{restored.bytes / 1e6:.1f} MB"
     ]
     if without_markers:
         lines.append(

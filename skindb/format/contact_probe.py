@@ -5,7 +5,7 @@ Limits are about ten times beyond any device known to us: they find wrong units 
 slips, not unusual devices.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -92,7 +92,15 @@ def read_probe(folder: Path, fields: Fields) -> ProbeRecord:
     fibres = fields.items("fibres", maximum=MAX_FIBRES)
     exposures = read_exposures(fields)
     sites = fields.names("sites", maximum=MAX_SITES)
-    placements = _placements(fields, sites)
+    by_site = fields.object("placements", {})
+    if unknown := sorted(set(by_site.data) - set(sites)):
+        by_site.fault(unknown[0], "must be one of the sites", shown(unknown[0]))
+    placements = {
+        site: by_site.names(site, maximum=MAX_PLACEMENTS)
+        if site in by_site.data
+        else ("",)
+        for site in sites
+    }
     frames = _template(fields, exposures, placements)
     linear = is_linear(frames)
     if linear:
@@ -140,21 +148,6 @@ def _template(
     if any(len(names) > 1 for names in placements.values()):
         needed.add(PLACEMENT)
     return fields.template("frames", needed, {EXPOSURE, PLACEMENT})
-
-
-def _placements(fields: Fields, sites: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Names of the placements of the probe at each site; a site without names has a
-    single placement.
-    """
-    by_site = fields.object("placements", {})
-    if unknown := sorted(set(by_site.data) - set(sites)):
-        by_site.fault(unknown[0], "must be one of the sites", shown(unknown[0]))
-    return {
-        site: by_site.names(site, maximum=MAX_PLACEMENTS)
-        if site in by_site.data
-        else ("",)
-        for site in sites
-    }
 
 
 def _azimuth(fibre: Fields) -> float:

@@ -28,19 +28,6 @@ KEPT = (  # with costs that benchmarks/omissions.py measured on a face of 23,393
 )
 
 
-def hidden_receivers(view: View, vertices: int) -> Omissions:
-    """The vertices at which a picture needs no subsurface light, as no visible triangle has them.
-
-    Light still comes from all vertices, and the picture is interpolated between the visible
-    ones, so the picture stays the same. Subsurface transport is computed even if it reaches
-    less than a pixel: it changes the diffuse term by 3 to 7 % RMS, and the bound from the
-    range of irradiance around a surfel is ten times larger.
-    """
-    hidden = int((~view.shown(vertices)).sum())
-    what = "surfels that receive subsurface light"
-    return (Omission(what, hidden, vertices, "they are not visible"),) if hidden else ()
-
-
 @dataclass(frozen=True)
 class ScenePlan:
     """The parts of a scene that a picture needs; everything that is skipped is in `omissions`."""
@@ -74,7 +61,12 @@ def plan_scene(
     pixels, skipped = covered_pixels(surface, camera)
     view = trace_view(surface, camera, scene=scene, pixels=pixels)
     if subsurface:
-        skipped += hidden_receivers(view, len(surface.vertices))
+        # light still comes from all vertices, and the picture is interpolated between
+        # the visible ones, so that it stays the same
+        shown = view.shown(len(surface.vertices))
+        what = "surfels that receive subsurface light"
+        if hidden := int((~shown).sum()):
+            skipped += (Omission(what, hidden, shown.size, "they are not visible"),)
     model, parameters, omissions = surface.model.simplified(surface.parameters)
     if omissions:
         surface = replace(surface, model=model, parameters=parameters)
@@ -85,22 +77,17 @@ def plan_scene(
         lights, omissions = lights_above_horizon(lights, view)
         skipped += omissions
     if subsurface:
-        skipped += (plan_octree(error),)
+        opening, bound = tree_opening(error)
+        reason = f"nodes that appear smaller than {opening:.3g} are not opened"
+        skipped += (
+            Omission(
+                "levels of the octree",
+                reason=reason,
+                bound=bound,
+                bounded="values of subsurface light",
+            ),
+        )
     return ScenePlan(surface, Lighting(lights, lighting.environment), pixels, skipped)
-
-
-def plan_octree(error: float | None) -> Omission:
-    """The levels of the octree for subsurface light that a picture with this relative
-    error skips.
-    """
-    opening, bound = tree_opening(error)
-    reason = f"nodes that appear smaller than {opening:.3g} are not opened"
-    return Omission(
-        "levels of the octree",
-        reason=reason,
-        bound=bound,
-        bounded="values of subsurface light",
-    )
 
 
 def covered_pixels(surface: Surface, camera: Camera) -> tuple[Mask, Omissions]:

@@ -308,7 +308,9 @@ def photograph(
         Called after each camera.
     """
     scene = RayScene(surface.vertices, surface.faces)
-    lights = render_lights(dome)
+    names = ("position", "intensity", "disc_radius", "axis", "falloff")
+    columns = (np.array([getattr(x, name) for x in dome.lights]) for name in names)
+    lights = Lights(*columns)
     white = frontal_camera(dome)
     for exposure, template in product(EXPOSURES, (FRAMES, DARK, WHITE)):
         file = folder / template.format(exposure=exposure, light="l", camera="c")
@@ -380,13 +382,6 @@ class _FrameWriter:
             )
             names = {"exposure": exposure, "light": light, "camera": self.camera.name}
             write_png(self.folder / template.format(**names), frame)
-
-
-def render_lights(dome: Dome) -> Lights:
-    """Convert the dome's lights for the renderer."""
-    names = ("position", "intensity", "disc_radius", "axis", "falloff")
-    columns = (np.array([getattr(x, name) for x in dome.lights]) for name in names)
-    return Lights(*columns)
 
 
 def frontal_camera(dome: Dome) -> DomeCamera:

@@ -4,7 +4,6 @@ import shutil
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 from xarray import DataTree
 
@@ -289,18 +288,12 @@ def parameters_of(
             f"no dictionary for a model made with {model['dictionary']!r}",
             f"name it with --dictionary, or give --dictionary {EMBEDDED_NAME}",
         )
-    return FitParameters(**{**_values_of_model(model, changes), **changes})
-
-
-def _values_of_model(model: Attributes, changes: Attributes) -> dict[str, Any]:
-    """Values that the parameters of a model had when it was requested; without those
-    that only its surface model has, if that changes.
-    """
     values = FitParameters.of({"parameters": model["requested"]}).as_dict()
+    # those that only the surface model of the fit has
     if changes.get("surface", values["surface"]) != values["surface"]:
         for name in ("k", "rank"):
             del values[name]
-    return values
+    return FitParameters(**{**values, **changes})
 
 
 def current_model(db: Database, take: str) -> Record | None:

@@ -134,7 +134,13 @@ def repeat_requests(
 def _repeat(db: Database, dictionary: Path | None, request: Request) -> Record:
     """Compute a result again."""
     if request.kind == "registration":
-        return _repeat_registration(db, request)
+        # all takes together: the common (u, v) depends on each of them
+        reference = request.parameters.get("reference") or None
+        if reference not in db.takes("model") or "statistics" not in db.consent(
+            reference
+        ):
+            reference = None
+        return next(iter(register_takes(db, reference=reference).values()))
     if request.kind == RELEASE:
         return _repeat_release(db, request)
     if request.kind == STUDY:
@@ -188,14 +194,6 @@ def repeat_study(
         options["dictionary"] = dictionary
     results = study(db, study_name, **options)
     return db.record(STUDY, key, results.attrs["generation"])
-
-
-def _repeat_registration(db: Database, request: Request) -> Record:
-    """All takes together: the common (u, v) depends on each of them."""
-    reference = request.parameters.get("reference") or None
-    if reference not in db.takes("model") or "statistics" not in db.consent(reference):
-        reference = None
-    return next(iter(register_takes(db, reference=reference).values()))
 
 
 def _repeat_release(db: Database, request: Request) -> Record:
