@@ -113,8 +113,8 @@ class Attribute:
             if len(same) > 1:
                 alike = " and ".join(map(repr, sorted(same)))
                 notes.append(f"{self.name}: {alike} count as different values")
-        ages = self.numbers[np.isfinite(self.numbers)] if self.name == AGE else []
-        odd = sorted({f"{age:g}" for age in ages if not 0 <= age <= MAX_AGE})
+        ages = self.numbers.tolist() if self.name == AGE else []
+        odd = sorted({f"{age:g}" for age in ages if age < 0 or age > MAX_AGE})
         if odd:
             examples = ", ".join(odd[:3])
             rule = f"must be in years, from 0 to {MAX_AGE}"

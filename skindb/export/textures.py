@@ -222,7 +222,7 @@ def _fit_base(
         both = pairs.product(matt, pairs.gloss(value))
         shine[rows] = np.einsum("ni,nj,ij->n", kept[rows], lobe[rows], both)
     seen = (amounts @ pairs.product(parts, matt) * kept).sum(axis=-1) - shine
-    return np.clip(seen / np.maximum(square, 1e-12), 0, 1).T
+    return np.asarray(np.clip(seen / np.maximum(square, 1e-12), 0, 1).T)
 
 
 def approximation_error(
