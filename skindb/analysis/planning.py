@@ -26,7 +26,7 @@ from skindb.analysis.formulas import (
     sum_of,
 )
 from skindb.analysis.long_form import INTERCEPT
-from skindb.analysis.study import Population, Results, Study, Table, table_of
+from skindb.analysis.study import Population, Results, Study, table_of
 from skindb.errors import require
 from skindb.parameters import option, require_limits
 from skindb.schema import dataset, variables
@@ -107,9 +107,8 @@ def sample_sizes(
     Noncentral t with the degrees of freedom of `linear_model`; Fitzmaurice, Laird and
     Ware 2011, chapter 20.
     """
-    require_limits(
-        Parameters(formula, term, effect, power, visits, design, doses, drop_out)
-    )
+    chosen = Parameters(formula, term, effect, power, visits, design, doses, drop_out)
+    require_limits(chosen)
     model = MixedModel.of(formula)
     names_of(model, [SUBJECT, "treatment", "visit"])
     require(effect != 0, "effect", "must differ from 0", "0", "give another value")
@@ -155,17 +154,7 @@ def sample_sizes(
     return dataset(
         dict(zip(COLUMNS, values, strict=True)),
         coords={"quantity": known["quantity"].values},
-        attrs={
-            "formula": formula,
-            "term": term,
-            "effect": effect,
-            "power": power,
-            "visits": visits,
-            "design": design,
-            "drop_out": drop_out,
-            "flags": known.attrs["flags"],
-            "skipped": known.attrs["skipped"],
-        },
+        attrs=vars(chosen) | {name: known.attrs[name] for name in ("flags", "skipped")},
     )
 
 
@@ -200,11 +189,6 @@ def _power(distance: Array, free: Array) -> Array:
         for side in (1, -1)
     ]
     return np.where(is_possible, np.sum(of_sides, axis=0), 0.0)
-
-
-def tabulate_plan(table: Dataset) -> Table:
-    """Header and one row per quantity."""
-    return table_of(table, COLUMNS, ("quantity",))
 
 
 def describe_plan(table: Dataset) -> list[str]:
@@ -273,7 +257,7 @@ STUDY = Study(
     parameters=Parameters,
     compute=compute,
     shown=("plan",),
-    tabulate=tabulate_plan,
+    tabulate=lambda table: table_of(table, COLUMNS, ("quantity",)),
     plot=plot_plan,
     describe=describe_plan,
     counts_takes=True,

@@ -30,16 +30,14 @@ from skindb.analysis.study import (
 from skindb.analysis.subjects import (
     CONDITION,
     Subjects,
-    known_traits,
     numeric_attributes,
     require_adjustable,
     sides,
     subjects_of,
-    trait_name,
     trait_names,
 )
 from skindb.analysis.summary import SAMPLED
-from skindb.errors import Fault, InputError, require
+from skindb.errors import InputError, require
 from skindb.numerics.inference import missing_patterns
 from skindb.numerics.statistics import known_mean
 from skindb.parameters import DICTIONARY_HELP, adjust_option, option, seed_option
@@ -85,7 +83,6 @@ def trait_vectors(
     basis: Dataset,
     albedo: Dataset,
     texture: Dataset | None = None,
-    traits: Sequence[str] | None = None,
     adjust: Sequence[str] = (),
     rng: Generator | None = None,
 ) -> Dataset:
@@ -99,11 +96,6 @@ def trait_vectors(
         From `population_basis` and `albedo_histograms` of the same takes.
     texture
         From `texture_statistics` of the registered ones of these takes.
-    traits
-        Names such as "condition:lotion", or numeric attributes such as "age", whose
-        vector is that of one unit (a year). By default every trait that some takes have
-        and others lack, and every numeric attribute. A condition is compared within the
-        subjects measured with and without it, if there are any.
     adjust
         Attributes for which comparisons between subjects are adjusted; subjects without
         them are excluded.
@@ -113,24 +105,28 @@ def trait_vectors(
     Returns
     -------
     Dataset
-        `trait_brdf_shift` and the `trait_brdf_distance` that it is,
+        Of every trait that some takes have and others lack, such as "condition:lotion",
+        and of every numeric attribute, such as "age", whose vector is that of one unit
+        (a year). A condition is compared within the subjects measured with and without
+        it, if there are any. `trait_brdf_shift` and the `trait_brdf_distance` that it is,
         `trait_histogram_shift`, `trait_quantile_shift`,
         `trait_log_sigma_tr_shift`, with `texture` also `trait_texture_shift`, and
         standard errors of all except histograms and texture by bootstrap over subjects
         (NaN if a side has fewer than two); `trait_count` (side: with, without; for
         numeric attributes all takes are "with"); `take_log_sigma_tr` (reference for the
         distance of an edit). NaN where a side has no such region, or no probe site was
-        measured on both sides. Attribute `flags`: traits with few subjects on a side.
+        measured on both sides. Attribute `flags`: traits with few subjects on a side,
+        and those that are excluded because the attributes in `adjust` determine them.
 
     Raises
     ------
     InputError
-        If no take or every take has a trait, if a trait is determined by the attributes
-        in `adjust`, or if the takes were fitted with different parameters.
+        If a name in `adjust` is not an attribute, or if the takes were fitted with
+        different parameters.
     """
     require_comparable(cohort, "tables")
     subjects = subjects_of(cohort)
-    split = _split_takes(subjects, traits)
+    split = _split_takes(subjects)
     require_adjustable(subjects, adjust)
     units: dict[str, Units] = {}
     flags = []
@@ -138,8 +134,6 @@ def trait_vectors(
         try:
             units[name] = _units(subjects, name, carries, lacks, adjust)
         except InputError as error:
-            if traits is not None:
-                raise
             flags.append(f"excluded: {error}")
     values = _compared_values(cohort, basis, albedo, texture)
     rng = np.random.default_rng(0) if rng is None else rng
@@ -176,43 +170,15 @@ def trait_vectors(
     )
 
 
-def _split_takes(
-    subjects: Subjects, traits: Sequence[str] | None
-) -> dict[str, tuple[Mask, Mask]]:
-    """Trait -> masks of the takes with and without it, of the named or of all traits;
-    for a numeric attribute, those in the condition normal that have it, and none.
-
-    Raises
-    ------
-    InputError
-        If a trait is unknown, or no take is on one of its sides.
+def _split_takes(subjects: Subjects) -> dict[str, tuple[Mask, Mask]]:
+    """Trait -> masks of the takes with and without it; all takes of a numeric attribute,
+    those in the condition normal, are on one side.
     """
-    comparable = trait_names(subjects)
-    numbers = numeric_attributes(subjects)
-    names = [*comparable, *numbers]
-    if traits is not None:
-        valid = sorted({*known_traits(subjects), *numbers})
-        names = [trait_name(name, valid) for name in traits]
-    split = {}
-    faults = []
-    for name in names:
-        if name in numbers:
-            is_known = np.isfinite(subjects.attribute(name).numbers)
-            carries = is_known & subjects.is_normal
+    split = {name: sides(subjects, name) for name in trait_names(subjects)}
+    for name in numeric_attributes(subjects):
+        carries = np.isfinite(subjects.attribute(name).numbers) & subjects.is_normal
+        if carries.any():
             split[name] = (carries, np.zeros_like(carries))
-            able = carries.any()
-        else:
-            split[name] = carries, lacks = sides(subjects, name)
-            able = carries.any() and lacks.any()
-        if not able:
-            rule = "there must be takes with and without it"
-            finding = "{} with, {} without".format(
-                *(side.sum() for side in split[name])
-            )
-            cure = f"choose from: {', '.join(comparable) or 'none'}"
-            faults.append(Fault(f"trait {name}", rule, finding, cure))
-    if faults:
-        raise InputError(faults)
     return split
 
 

@@ -28,6 +28,16 @@ from skindb.workflow.audit import logged_action
 from skindb.workflow.captures import RIG, require_kind_of_calibration, takes_of_earlier
 from skindb.workflow.fit import current_model, takes_without_consent
 
+# figure of the description: variable, of which it is the largest value
+FIGURES = {
+    "largest_relative_error": variables.RIG_LIGHT_GAIN_ERROR,
+    "largest_angle_error": variables.RIG_LIGHT_ANGLE_ERROR,
+    "spread": variables.RIG_SPREAD,
+    "spread_left": variables.RIG_SPREAD_LEFT,
+    "camera_spread": variables.RIG_CAMERA_SPREAD,
+    "camera_spread_left": variables.RIG_CAMERA_SPREAD_LEFT,
+}
+
 
 def calibrate_rig(
     db: Database,
@@ -145,27 +155,16 @@ def describe_rig(db: Database, record: Record) -> dict[str, Any]:
         if db.has("capture", take)
         and not db.record("capture", take).provenance.get("calibrated_by")
     }
-    return {
+    figures = {name: float(rig[variable].max()) for name, variable in FIGURES.items()}
+    return figures | {
         "lights": rig.sizes["light"],
         "takes": record.provenance["parameters"]["takes"],
         "light_gains": bool((rig[variables.RIG_LIGHT_GAIN] != 1).any()),
-        "largest_relative_error": float(rig[variables.RIG_LIGHT_GAIN_ERROR].max()),
-        "spread": float(rig[variables.RIG_SPREAD]),
-        "spread_left": float(rig[variables.RIG_SPREAD_LEFT]),
         "cameras": rig.sizes["camera"],
-        "camera_spread": float(rig[variables.RIG_CAMERA_SPREAD]),
-        "camera_spread_left": float(rig[variables.RIG_CAMERA_SPREAD_LEFT]),
         "camera_gains": bool((rig[variables.RIG_CAMERA_GAIN] != 1).any()),
-        "misfit": dict(
-            zip(
-                rig["correction"].values.tolist(),
-                rig[variables.RIG_MISFIT].values.tolist(),
-                strict=True,
-            )
-        ),
+        "misfit": rig[variables.RIG_MISFIT].to_series().to_dict(),
         "lobes": rig_lobes(rig),
         "angle": float(np.degrees(np.sqrt(np.square(turns).sum(axis=1).mean()))),
-        "largest_angle_error": float(rig[variables.RIG_LIGHT_ANGLE_ERROR].max()),
         "without_gain": [str(light) for light in few],
         "ingest_again": sorted(uncorrected.union(takes_of_earlier(db, record))),
     }

@@ -39,20 +39,6 @@ def test_trait_vectors__planted_differences():
     np.testing.assert_allclose(male, np.log([1.2, 0.8]).mean(), atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("trait", "said"),
-    [
-        ("nobody", "must name exactly one trait of the population"),
-        ("gender:male", "there must be takes with and without it; found 2 with, 0"),
-    ],
-)
-def test_trait_vectors__traits_of_no_take_or_all_takes(trait, said):
-    models = {take: model for take, model in population().items() if take in ("B", "C")}
-    basis, albedo, _ = analysed(models)
-    with pytest.raises(InputError, match=said):
-        trait_vectors(tables(models), basis=basis, albedo=albedo, traits=[trait])
-
-
 def test_trait_vectors__sites_do_not_pass_for_traits():
     """Male takes were measured at the neck only; the level of the other site must not matter."""
     models = population()
@@ -91,7 +77,6 @@ def test_trait_vectors__takes_go_by_name():
         tables(turned),
         basis=basis.sel(take=order),
         albedo=albedo.sel(take=order),
-        traits=["male"],
     )
     for name in (
         "trait_brdf_shift",
