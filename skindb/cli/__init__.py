@@ -15,7 +15,7 @@ import skindb
 from skindb.cli.captures import demo, ingest, simulate
 from skindb.cli.fitting import dictionary_command, fit
 from skindb.cli.imports import import_command, quick
-from skindb.cli.laboratory import calibrate, capture, landmarks
+from skindb.cli.laboratory import calibrate, capture, check_device, landmarks
 from skindb.cli.pictures import compare, export, render, show, view
 from skindb.cli.population import edit, register, reproduce
 from skindb.cli.shared import echo_json, fault_lines
@@ -44,6 +44,7 @@ for _command in (
     simulate,
     calibrate,
     capture,
+    check_device,
     landmarks,
     quick,
     import_command,

@@ -1,4 +1,4 @@
-"""Commands for the laboratory: capture, calibrate, landmarks."""
+"""Commands for the laboratory: capture, check-device, calibrate, landmarks."""
 
 from __future__ import annotations
 
@@ -71,6 +71,20 @@ def _ask(site: str, number: int) -> None:
     except click.Abort:
         # the session keeps and reports what it has recorded
         raise KeyboardInterrupt from None
+
+
+@command
+@click.argument("url", metavar="PORT")
+def check_device(url: str) -> None:
+    """Compare a light controller or a probe with docs/protocol.md.
+
+    PORT is a serial port or socket://HOST:PORT. Every exchange of the page that needs no
+    hands is tried: damaged and repeated lines, refusals, a plan with three flashes,
+    reports, emergency stop and watchdog, or pressure and an exposure. Nobody should be in
+    the dome or at the probe.
+    """
+    kind, faults = workflow.check_device(url)
+    emit({"kind": kind}, [] if faults else [f"{url}: a {kind} that agrees"], faults)
 
 
 @command

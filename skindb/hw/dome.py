@@ -96,6 +96,7 @@ class Dome:
                 raise self.link.error(
                     f"must accept {len(schedule.steps)} steps within {seconds:.1f} s",
                     f"{index} steps",
+                    FIRMWARE_CURE,
                 )
             light = {"light": step.light, "exposure": step.exposure}
             self.link.request(
@@ -106,12 +107,13 @@ class Dome:
             raise self.link.error(
                 f"must hold {len(schedule.steps)} steps, digest {schedule.digest}",
                 f"{held.get('steps')} steps, digest {held.get('digest')}",
+                FIRMWARE_CURE,
             )
 
     def holds(self, schedule: Schedule) -> bool:
         """Whether the controller holds exactly these steps."""
         held = self.link.request("PLAN").values
-        plan = (held.get("steps"), held.get("digest"))
+        plan = (held.get("steps"), held.get("digest", "").upper())
         return plan == (str(len(schedule.steps)), schedule.digest)
 
     def arm(
@@ -288,6 +290,7 @@ class Dome:
             raise self.link.error(
                 f"must finish step {state.step} within {latest:.1f} s",
                 f"no progress after {at_least:.1f} s",
+                FIRMWARE_CURE,
             )
         if state.step > 0:
             planned = schedule.steps[state.step - 1].off_us / 1e6

@@ -42,6 +42,7 @@ BAUD_RATE = 115_200
 REPLY_SECONDS = 0.3  # within which a device must answer
 # of a request, together less than a second, after which a device counts as lost
 ATTEMPTS = 3
+BOOT_SECONDS = 5.0  # in which a board that resets when its port is opened must answer
 READ_SECONDS = 0.005  # timeout of one read of the port
 # without a request, after which a device switches everything off
 WATCHDOG_SECONDS = 0.5
@@ -217,6 +218,10 @@ class DeviceError(InputError):
     """A device does not answer, refuses a request, or sends an unexpected reply."""
 
 
+class NoReplyError(DeviceError):
+    """A device did not answer a request in time."""
+
+
 class RefusedError(DeviceError):
     """A device is connected and refused a request."""
 
@@ -310,9 +315,8 @@ class Link:
             noise = (
                 f", and {self.damaged} damaged lines, the last {self._lines.sample!r}"
             )
-        raise self.error(
-            f"must answer {verb} within {seconds:.1f} s", f"no reply{noise}"
-        )
+        rule = f"must answer {verb} within {seconds:.1f} s"
+        raise NoReplyError(Fault(self.name, rule, f"no reply{noise}", CURE))
 
     def value(self, message: Message, name: str, accepted: Accepted[T]) -> T:
         """A value of a reply or an event.
@@ -336,10 +340,17 @@ class Link:
             ) from None
 
     def hello(self, kind: str) -> Message:
-        """Identify the device; raises `DeviceError` unless it has this kind and the
-        supported protocol.
+        """Identify the device, which may start only now; raises `DeviceError` unless it
+        has this kind and the supported protocol.
         """
-        reply = self.request("HELLO")
+        deadline = self.clock.monotonic() + BOOT_SECONDS
+        while True:
+            try:
+                reply = self.request("HELLO")
+                break
+            except NoReplyError:
+                if self.clock.monotonic() >= deadline:
+                    raise
         greeting = (
             reply.values.get("kind", "an unknown device"),
             reply.values.get("protocol", "?"),

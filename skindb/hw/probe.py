@@ -271,6 +271,7 @@ class Probe:
                 raise self.link.error(
                     f"must expose {name} within {seconds + SLACK_SECONDS:.1f} s",
                     f"still exposing after {elapsed:.1f} s",
+                    FIRMWARE_CURE,
                 )
             clock.sleep(min(POLL_SECONDS, seconds))
         if elapsed < seconds * (1 - CLOCK_ERROR) - EARLY_SECONDS:

@@ -308,7 +308,7 @@ class EmulatedDome(Emulated):
         return {"steps": len(self.steps), "digest": self._digest()}
 
     def _arm(self, values: dict[str, str]) -> dict[str, object]:
-        if not self.steps or values["digest"] != self._digest():
+        if not self.steps or values["digest"].upper() != self._digest():
             raise RefusedError("another plan is held")
         if not self.interlock_closed:
             raise RefusedError("the interlock is open")

@@ -50,7 +50,7 @@ from .pictures import (
 )
 from .quicklook import quick
 from .rig import calibrate_rig, describe_rig
-from .session import capture_session, plan_session
+from .session import capture_session, check_device, plan_session
 from .simulation import begin_simulation, simulate
 from .studies import STUDY_FUNCTIONS, study, tidy_table
 from .takes import (
@@ -77,6 +77,7 @@ __all__ = [
     "calibrate",
     "calibrate_rig",
     "capture_session",
+    "check_device",
     "clean",
     "compare_take",
     "computing_on",

@@ -16,6 +16,7 @@ from skindb.files import Json, make_private, private_umask
 from skindb.format.fields import IDENTIFIER, read_json
 from skindb.format.folder import read_capture, record_faults
 from skindb.geometry.scan import read_scan
+from skindb.hw import conformance
 from skindb.hw.cameras import FolderCameras
 from skindb.hw.capture import CapturePlan, Devices, planned_schedule, run_capture
 from skindb.hw.capture_folder import (
@@ -85,6 +86,25 @@ def plan_session(
         "safe": assessment.safe,
         "steps": len(schedule.steps),
     }, lines
+
+
+def check_device(url: str) -> tuple[str, list[Fault]]:
+    """Kind of the device at a port, and what it does otherwise than docs/protocol.md; see
+    `skindb.hw.conformance`.
+
+    Raises
+    ------
+    InputError
+        If there is no device at this address, or it closes its line.
+    """
+    port = open_port(url)
+    try:
+        return conformance.check_device(port)
+    except OSError as error:  # of pyserial, too
+        cure = "check its power and its cable"
+        raise input_error(url, "must stay connected", str(error), cure) from None
+    finally:
+        port.close()
 
 
 def capture_session(

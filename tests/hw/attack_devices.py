@@ -58,8 +58,8 @@ PLAN = CapturePlan(seconds=2.0, sites=("cheek",))
 ATTACKED_LIGHTS = LIGHTS[::3]
 LONG_BRACKETS = {name: 10 * seconds for name, seconds in BRACKETS.items()}
 # By the simulated clock: four runs of 54 steps, of which 21 are flashes of markers, with
-# their uploads, reports and last frames, and three placements.
-MAX_SECONDS = 4 * (56 * 0.3 + 5.0 + 2.0 + 55 * 0.9 + 15.0 + 12.0) + 3 * 45.0
+# their uploads, reports and last frames, three placements, and two boards that start.
+MAX_SECONDS = 4 * (56 * 0.3 + 5.0 + 2.0 + 55 * 0.9 + 15.0 + 12.0) + 3 * 45.0 + 2 * 6.0
 ODD_VALUES = (
     *(
         "nan",

@@ -27,6 +27,7 @@ from skindb.hw.dome import Dome
 from skindb.hw.frame_markers import MARKER, with_markers
 from skindb.hw.link import (
     ATTEMPTS,
+    BOOT_SECONDS,
     EVENT,
     MAX_LINE_BYTES,
     MAX_NUMBER,
@@ -432,6 +433,21 @@ def test_run__emergency_stop_at_any_moment(subject, tmp_path, at):
             InputError, match="must run to its end; found stopped by the operator"
         ):
             require_complete(run, bench.cameras.ids)
+
+
+@pytest.mark.parametrize("seconds", [4.0, 7.0])
+def test_hello__a_board_that_starts_when_its_port_is_opened(seconds):
+    """It hears nothing meanwhile."""
+    device = emulated_dome()
+    receive = device.receive
+    device.receive = lambda data: (
+        receive(data) if device.clock.monotonic() > seconds else None
+    )
+    if seconds < BOOT_SECONDS:
+        assert Dome(linked(device)).lights == tuple(LIGHTS)
+    else:
+        with pytest.raises(DeviceError, match="must answer HELLO"):
+            Dome(linked(device))
 
 
 def test_arm__refused_with_an_open_interlock_or_without_an_operator():

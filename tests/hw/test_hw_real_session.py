@@ -5,6 +5,8 @@ in watched folders.
 from __future__ import annotations
 
 import json
+import socket
+import threading
 
 import pytest
 from click.testing import CliRunner
@@ -89,3 +91,14 @@ def test_capture__a_real_session_without_a_confirmation_is_refused(setup, tmp_pa
         in str(result.exception)
     )
     assert laboratory.dome._runs == 0
+
+
+def test_check_device__a_line_that_is_closed():
+    """The program at the other end leaves at the first line."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        leave = threading.Thread(target=lambda: listener.accept()[0].close())
+        leave.start()
+        url = f"socket://127.0.0.1:{listener.getsockname()[1]}"
+        result = CliRunner().invoke(cli, ["check-device", url])
+        leave.join()
+    assert f"{url}: must stay connected; found " in str(result.exception)
