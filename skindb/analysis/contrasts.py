@@ -155,20 +155,17 @@ def unreliable_surfaces(cohort: Dataset, group_by: str) -> list[str]:
     """Warnings about comparisons of surface BRDFs, whose errors are not known: the surface
     reflectance of the face has a low reliability.
     """
-    flags = []
+    of_face = cohort.sel(region=[FACE]) if "region" in cohort.dims else cohort
     measure = partial(quantities_of, names=(SURFACE,))
     with suppress(InputError):  # of what the tables of the cohort cannot compare
-        for contrast in contrasts(cohort, group_by, (), measure):
-            known = dict(
-                zip(contrast.quantities.names, contrast.reliability, strict=True)
-            )
-            value = known.get(f"{SURFACE} {FACE}", np.nan)
-            if value < MIN_RELIABILITY:
-                flags.append(
-                    f"{contrast.name}: errors explain the differences of BRDFs: the "
-                    f"reliability of the {SURFACE} of the {FACE} is {value:.2f}"
-                )
-    return flags
+        return [
+            f"{contrast.name}: errors explain the differences of BRDFs: the reliability of "
+            f"the {SURFACE} of the {FACE} is {value:.2f}"
+            for contrast in contrasts(of_face, group_by, (), measure)
+            for value in contrast.reliability
+            if value < MIN_RELIABILITY
+        ]
+    return []
 
 
 def _covariates(

@@ -171,7 +171,7 @@ def _differences(measured: list[Measurement], baseline: Index) -> Iterator[Measu
     absent = np.where(is_own[:, None], "baseline", absent)
     words = np.where(np.isfinite(values), "fitted", absent)
     yield Measurement(
-        replace(REFLECTANCE, name=COLOUR_DIFFERENCE, dims=("region",)),
+        replace(REFLECTANCE, name=COLOUR_DIFFERENCE),
         reflectance.labels[:1],
         values,
         errors,

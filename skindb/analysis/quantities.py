@@ -23,7 +23,7 @@ from skindb.analysis.subjects import LEVEL, level_error
 from skindb.errors import Fault, InputError, require
 from skindb.geometry.mesh import lattice_spacing
 from skindb.numerics.statistics import Moments, known_mean
-from skindb.schema import IDENTIFIED, ProbeStatus, variables
+from skindb.schema import IDENTIFIED, VARIABLES, ProbeStatus, variables
 from skindb.schema.label import CHANNELS
 from skindb.schema.notes import Note, note
 from skindb.types import AnyArray, Array, Index, Mask, float64
@@ -35,6 +35,8 @@ MIN_SUBJECTS = 3  # for a variance between or within subjects
 # one scanner differ by a few per cent, levels of subdivision by a factor of two.
 MAX_SPACING_RATIO = 1.3
 SPACING = (variables.REGION_AREA, variables.REGION_SURFELS)
+# ends of the names of standard errors, without what takes have in common and with it
+ERRORS = ("_error", "_total_error")
 SURFACE = "surface reflectance"
 TYPOLOGY_ANGLE = "ITA"
 COLOUR_DIFFERENCE = "delta E"
@@ -46,10 +48,7 @@ class Quantity:
 
     name: str
     tabulated: str
-    mapped: str  # empty for quantities of regions alone
-    dims: tuple[str, ...]  # of the table, after the take
-    error: str  # variable of the table, without what all takes have in common
-    total_error: str  # variable of the table
+    mapped: str = ""  # empty for quantities of regions alone
     unit: str = "1"
     is_log: bool = (
         False  # whether logarithms are compared, so that intervals stay positive
@@ -59,6 +58,12 @@ class Quantity:
     )
     # function of R_d (..., channel), for quantities that are derived from it
     derive: Callable[[Array], Array] | None = None
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        """Dims of the table, after the take."""
+        dims = VARIABLES[self.tabulated].dims
+        return dims if self.derive is None else dims[:-1]
 
     def compared(self, values: Array) -> Array:
         """The variable's values (..., channel) as they are compared: derived, or
@@ -75,9 +80,6 @@ REFLECTANCE = Quantity(
     "R_d",
     variables.REGION_DIFFUSE_REFLECTANCE,
     variables.TEXEL_DIFFUSE_REFLECTANCE,
-    ("region", "channel"),
-    variables.REGION_DIFFUSE_REFLECTANCE_ERROR,
-    variables.REGION_DIFFUSE_REFLECTANCE_TOTAL_ERROR,
     has_common_error=True,
 )
 MEASURED = (
@@ -86,47 +88,21 @@ MEASURED = (
         SURFACE,
         variables.REGION_SURFACE_REFLECTANCE,
         variables.TEXEL_SURFACE_REFLECTANCE,
-        ("region",),
-        variables.REGION_SURFACE_REFLECTANCE_ERROR,
-        variables.REGION_SURFACE_REFLECTANCE_ERROR,
     ),
     Quantity(
         "sigma_tr",
         variables.SITE_SIGMA_TR,
         variables.TEXEL_SIGMA_TR,
-        ("site", "channel"),
-        variables.SITE_SIGMA_TR_ERROR,
-        variables.SITE_SIGMA_TR_TOTAL_ERROR,
         unit="mm-1",
         is_log=True,
     ),
 )
-
 GLOSSINESS = Quantity(
-    "glossiness",
-    variables.REGION_GLOSSINESS,
-    variables.TEXEL_GLOSSINESS,
-    ("region",),
-    variables.REGION_GLOSSINESS_ERROR,
-    variables.REGION_GLOSSINESS_ERROR,
+    "glossiness", variables.REGION_GLOSSINESS, variables.TEXEL_GLOSSINESS
 )
 ROUGHNESS = (
-    Quantity(
-        "albedo contrast",
-        variables.REGION_ALBEDO_CONTRAST,
-        "",
-        ("region", "channel"),
-        variables.REGION_ALBEDO_CONTRAST_ERROR,
-        variables.REGION_ALBEDO_CONTRAST_ERROR,
-    ),
-    Quantity(
-        "RMS slope",
-        variables.REGION_NORMAL_SLOPE,
-        "",
-        ("region",),
-        variables.REGION_NORMAL_SLOPE_ERROR,
-        variables.REGION_NORMAL_SLOPE_ERROR,
-    ),
+    Quantity("albedo contrast", variables.REGION_ALBEDO_CONTRAST),
+    Quantity("RMS slope", variables.REGION_NORMAL_SLOPE),
 )
 
 
@@ -149,7 +125,7 @@ QUANTITIES = {
         GLOSSINESS,
         *ROUGHNESS,
         *(
-            replace(REFLECTANCE, name=name, dims=("region",), unit=unit, derive=derive)
+            replace(REFLECTANCE, name=name, unit=unit, derive=derive)
             for name, (unit, derive) in DERIVED.items()
         ),
     )
@@ -306,12 +282,13 @@ def measurements(
     names
         Of the quantities.
     """
-    prefixes = ("region_", "site_")
-    tables = cohort[[name for name in cohort if str(name).startswith(prefixes)]].load()
     level = np.zeros(cohort.sizes["take"])
     if LEVEL in cohort.coords:
         level = np.nan_to_num(cohort[LEVEL].values.astype(float))
     quantities = chosen_quantities(names)
+    needed = {variables.SITE_STATUS, *SPACING}
+    needed |= {f"{x.tabulated}{end}" for x in quantities for end in ("", *ERRORS)}
+    tables = cohort[[name for name in cohort if name in needed]].load()
     relative = is_relative(cohort)
     return [
         _measured(tables, quantity, level, relative)
@@ -337,13 +314,14 @@ def _measured(
         dims.append("channel")
     select = trusted if is_site else Dataset.__getitem__
     values: Array = float64(select(tables, quantity.tabulated).transpose(*dims).values)
-    error: Array
-    error, total = (
+    names = [f"{quantity.tabulated}{end}" for end in ERRORS]
+    errors: list[Array] = [
         float64(tables[name].transpose(*dims).values)
+        for name in names
         if name in tables
-        else np.full_like(values, np.nan)
-        for name in (quantity.error, quantity.total_error)
-    )
+    ] or [np.full_like(values, np.nan)]
+    error = errors[0]
+    total = errors[-1]
     of_level: Array = np.zeros_like(values)
     if quantity.has_common_error:
         of_level = of_level + level.reshape(-1, *[1] * (values.ndim - 1))

@@ -13,7 +13,7 @@ from xarray import Dataset
 
 from skindb.geometry.mesh import lattice_spacing
 from skindb.schema import variables
-from skindb.types import Array, Index, Mask, float64, lengths, unit
+from skindb.types import Array, Index, Mask, finite_rows, float64, lengths, unit
 
 # mm, at which each Gaussian passes half of an amplitude: mottled pigment and folds
 WAVELENGTHS = (10.0, 25.0)
@@ -87,6 +87,7 @@ def band_deviations(fitted: Dataset, trusted: Mask) -> Deviations:
     ratio = (SIGMAS[0] / SIGMAS[1]) ** 2
     noise = (1 + ratio - 4 * ratio / (1 + ratio)) * (fine.power(2) @ error**2)
     inside = (complete > MIN_COMPLETE) & (lengths(mean_normal) > MIN_FLATNESS)
+    inside &= finite_rows(noise)  # errors of some surfels may be unknown
     return Deviations(
         surfels[node][inside], node_area[inside], square[inside], noise[inside]
     )

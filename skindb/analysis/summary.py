@@ -227,19 +227,17 @@ def _roughness(
     explains more than half of the squared deviations.
     """
     patch = patch[deviations.surfel]
-    signal = deviations.square - deviations.noise
-    none = np.full(signal.shape, np.nan)
     roughness = np.full((2, len(inside), 4), np.nan)
     for region, rows in enumerate(inside[:, deviations.surfel]):
         weight = deviations.area[rows]
-        noise, _ = _weighted_mean(deviations.noise[rows], none[rows], weight)
-        for k in range(4):
-            mean, error = _patch_mean(
-                signal[rows, k], none[rows, k], weight, patch[rows]
-            )
-            if mean > noise[k] and weight.sum() >= MIN_AREA:
-                root = np.sqrt(mean)
-                roughness[:, region, k] = root, error / (2 * root)
+        if weight.sum() < MIN_AREA:
+            continue
+        noise = np.average(deviations.noise[rows], axis=0, weights=weight)
+        signal = deviations.square[rows] - deviations.noise[rows]
+        mean = np.average(signal, axis=0, weights=weight)
+        root = np.sqrt(np.where(mean > noise, mean, np.nan))
+        scatter = [_patch_error(x, weight, patch[rows]) for x in (signal - mean).T]
+        roughness[:, region] = root, scatter / (2 * root)
     values, errors = roughness
     return {
         variables.REGION_ALBEDO_CONTRAST: values[:, :3],

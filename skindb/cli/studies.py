@@ -42,6 +42,13 @@ if TYPE_CHECKING:
 
     from skindb.store import Database
 
+NOTES = {  # of results, with their labels
+    "skipped": "skipped",
+    "outdated": "out of date",
+    "registration": "registration",
+    "spacing": "spacing",
+    "as_normal": "as normal",
+}
 ANALYSIS = Path(skindb.__file__).parent / "analysis"
 # of every study, after its own parameters
 STORED = (
@@ -276,17 +283,6 @@ def _report(
     attrs = results.attrs
     record = database.record("population", attrs["study"], attrs["generation"])
     notes = skindb.analysis.describe_study(results)
-    lines = [
-        f"{label}: {line}"
-        for label, name in (
-            ("skipped", "skipped"),
-            ("out of date", "outdated"),
-            ("registration", "registration"),
-            ("spacing", "spacing"),
-            ("as normal", "as_normal"),
-        )
-        for line in skindb.schema.note_lines(attrs.get(name, []))
-    ]
     units = {
         name: skindb.schema.VARIABLES[name].units
         for name in header
@@ -301,14 +297,22 @@ def _report(
         "rows": rows,
         "notes": notes,
         "visits": attrs.get("visits", ""),
-        "skipped": attrs["skipped"],
-    }
+    } | {name: attrs.get(name, []) for name in NOTES}
     hidden = skindb.analysis.STUDIES[study.name].columns_of_files
     columns = [i for i, name in enumerate(header) if name not in hidden]
     table = aligned([[line[i] for i in columns] for line in [header, *rows]])
     table += _unit_lines(units, [header[i] for i in columns])
     visits = [f"visits: {attrs['visits']}"] if attrs.get("visits") else []
-    emit(report, [*visits, *table, *notes, *lines])
+    emit(report, [*visits, *table, *notes, *_note_lines(report)])
+
+
+def _note_lines(notes: dict[str, Any]) -> list[str]:
+    """The notes of `NOTES` with their labels, one line each."""
+    return [
+        f"{label}: {line}"
+        for name, label in NOTES.items()
+        for line in skindb.schema.note_lines(notes.get(name, []))
+    ]
 
 
 def _unit_lines(units: dict[str, str], columns: list[str]) -> list[str]:
@@ -335,7 +339,9 @@ def tidy(db: str, takes: tuple[str, ...], release: str | None, out: Path) -> Non
     """
     writable(out, ".csv", ".parquet")
     database = existing(db)
-    table, *notes = workflow.tidy_table(database, takes=takes, release=release)
+    table, skipped, spacing = workflow.tidy_table(
+        database, takes=takes, release=release
+    )
     if out.suffix == ".csv":
         text = csv_text([*table], table.values.tolist())
         private_file(out).write_text(text, encoding="utf-8")
@@ -347,11 +353,6 @@ def tidy(db: str, takes: tuple[str, ...], release: str | None, out: Path) -> Non
                 str(out), "needs pyarrow", "none", "pip install pyarrow, or write .csv"
             ) from None
         private_file(out).write_bytes(data)
-    labelled = dict(zip(("skipped", "spacing"), notes, strict=True))
-    lines = [
-        f"{label}: {line}"
-        for label, said in labelled.items()
-        for line in skindb.schema.note_lines(said)
-    ]
-    report = {"path": str(out), "rows": len(table), **labelled}
-    emit(report, [f"{out}: {len(table)} rows", *lines])
+    notes = {"skipped": skipped, "spacing": spacing}
+    report = {"path": str(out), "rows": len(table)} | notes
+    emit(report, [f"{out}: {len(table)} rows", *_note_lines(notes)])
