@@ -7,7 +7,7 @@ The band is the difference of two Gaussians over the surface, by distances in sp
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, vstack
 from scipy.spatial import cKDTree
 from xarray import Dataset
 
@@ -25,6 +25,7 @@ STEP = (
     3.0  # mm between the places of the band, below the smaller Gaussian's width of 4.4
 )
 REACH = 4.0  # standard deviations
+PLACES = 500  # whose pairs with surfels are in memory at a time
 # length of the mean normal over the larger Gaussian: 16 degrees about it. Where the surface
 # bends more, as on a nose, its shape is in the band, and errors of folds are
 MIN_FLATNESS = 0.96
@@ -84,8 +85,9 @@ def band_deviations(fitted: Dataset, trusted: Mask) -> Deviations:
     mean_normal = coarse @ smooth
     turn = lengths(smooth - unit(mean_normal))
     square = np.column_stack([log - coarse @ log, turn]) ** 2
+    fine.data **= 2
     ratio = (SIGMAS[0] / SIGMAS[1]) ** 2
-    noise = (1 + ratio - 4 * ratio / (1 + ratio)) * (fine.power(2) @ error**2)
+    noise = (1 + ratio - 4 * ratio / (1 + ratio)) * (fine @ error**2)
     inside = (complete > MIN_COMPLETE) & (lengths(mean_normal) > MIN_FLATNESS)
     inside &= finite_rows(noise)  # errors of some surfels may be unknown
     return Deviations(
@@ -99,10 +101,18 @@ def _gaussian(
     """Matrix (n, m) of Gaussian means at places (n, 3) mm over points with areas, and the
     fraction (n,) of each Gaussian that has points.
     """
-    near = cKDTree(places).sparse_distance_matrix(
-        cKDTree(position), REACH * width, output_type="coo_matrix"
-    )
-    weight = area[near.col] * np.exp(-0.5 * (near.data / width) ** 2)
-    total = np.bincount(near.row, weight, len(places))
-    matrix = csr_array((weight / total[near.row], (near.row, near.col)), near.shape)
+    tree = cKDTree(position)
+    parts = []
+    # of some places at a time: a fine scan has millions of pairs
+    for part in np.array_split(places, len(places) // PLACES + 1):
+        near = csr_array(
+            cKDTree(part).sparse_distance_matrix(
+                tree, REACH * width, output_type="coo_matrix"
+            )
+        )
+        near.data = area[near.indices] * np.exp(-0.5 * (near.data / width) ** 2)
+        parts.append(near)
+    matrix = csr_array(vstack(parts))
+    total = np.asarray(matrix.sum(axis=1))
+    matrix.data /= np.repeat(total, np.diff(matrix.indptr))
     return matrix, total / (2 * np.pi * width**2)
