@@ -411,11 +411,7 @@ class Link:
 
     def close(self) -> None:
         """Close the port and the log."""
-        connection = getattr(self._port, "_socket", None)
-        self._port.close()
-        # pyserial leaves the socket open if the other end is closed
-        if connection is not None:
-            connection.close()
+        close_port(self._port)
         if self._log is not None:
             self._log.close()
 
@@ -511,6 +507,14 @@ def open_port(url: str) -> Port:
             )
         ) from None
     return port
+
+
+def close_port(port: Port) -> None:
+    """Close a port; pyserial leaves a socket open if the other end is closed."""
+    connection = getattr(port, "_socket", None)
+    port.close()
+    if connection is not None:
+        connection.close()
 
 
 def _system_reason(error: BaseException | None) -> str:

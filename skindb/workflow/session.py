@@ -28,7 +28,7 @@ from skindb.hw.capture_folder import (
 )
 from skindb.hw.dome import Dome
 from skindb.hw.frame_markers import marker_light, with_markers
-from skindb.hw.link import Link, open_port
+from skindb.hw.link import Link, close_port, open_port
 from skindb.hw.probe import Probe
 from skindb.hw.sequence import Override, Rehearsal, assess, slower_alternative
 from skindb.parameters import VIRTUAL_SEED, SessionParameters
@@ -104,7 +104,7 @@ def check_device(url: str) -> tuple[str, list[Fault]]:
         cure = "check its power and its cable"
         raise input_error(url, "must stay connected", str(error), cure) from None
     finally:
-        port.close()
+        close_port(port)
 
 
 def capture_session(
