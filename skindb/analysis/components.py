@@ -9,7 +9,7 @@ import numpy as np
 from xarray import DataArray, Dataset
 
 from skindb.analysis.face_models import ALBEDO, POSITION, face_at, face_model
-from skindb.analysis.study import Population, Results, Study, Table, table_of
+from skindb.analysis.study import Study, Table, of_cohort, table_of
 from skindb.parameters import adjust_option, option, seed_option
 from skindb.render.image import tone_map
 from skindb.schema import variables
@@ -107,23 +107,12 @@ class Parameters:
     seed: int = seed_option("samples whose distance from subjects is reported")
 
 
-def compute(population: Population, parameters: Parameters) -> Results:
-    """The results of the study."""
-    model = face_model(
-        population.cohort,
-        k=parameters.k,
-        adjust=parameters.adjust,
-        rng=np.random.default_rng(parameters.seed),
-    )
-    return {"face_model": model}
-
-
 STUDY = Study(
     name="components",
     description="joint modes of shape, albedo, gloss and translucency, drawn as faces",
     layout="maps",
     parameters=Parameters,
-    compute=compute,
+    compute=of_cohort("face_model", face_model),
     shown=("face_model",),
     tabulate=tabulate_face_model,
     plot=plot_face_model,

@@ -49,7 +49,6 @@ from skindb.numerics.inference import (
     sign_flip_p,
 )
 from skindb.numerics.statistics import ROUNDING
-from skindb.parameters import ContrastParameters
 from skindb.schema.label import FACE
 from skindb.types import Array, finite_rows
 
@@ -61,17 +60,6 @@ FEW = 10
 # multiple correlation from which an attribute counts as confounder: a quarter of the
 # variance
 ASSOCIATED = 0.5
-
-
-def contrast_arguments(parameters: ContrastParameters) -> dict[str, Any]:
-    """Keyword arguments of the function that compares the groups of a population."""
-    return {
-        "group_by": parameters.group_by,
-        "adjust": parameters.adjust,
-        "quantities": parameters.quantities,
-        "permutations": parameters.permutations,
-        "rng": np.random.default_rng(parameters.seed),
-    }
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,7 @@ from xarray import Dataset
 
 from skindb import plots
 from skindb.analysis.quantities import SURFACE, Quantities, quantities_of
-from skindb.analysis.study import (
-    Population,
-    Results,
-    Study,
-    skipped_takes,
-    table_of,
-)
+from skindb.analysis.study import Study, of_cohort, skipped_takes, table_of
 from skindb.analysis.subjects import takes_to_compare
 from skindb.errors import require
 from skindb.numerics.statistics import known_mean
@@ -234,22 +228,12 @@ class Parameters:
     seed: int = seed_option("the permutations and the bootstrap")
 
 
-def compute(population: Population, parameters: Parameters) -> Results:
-    """The results of the study."""
-    table = component_correlations(
-        population.cohort,
-        permutations=parameters.permutations,
-        rng=np.random.default_rng(parameters.seed),
-    )
-    return {"correlations": table}
-
-
 STUDY = Study(
     name="correlations",
     description="correlations between albedo, surface BRDF and translucency",
     layout="tables",
     parameters=Parameters,
-    compute=compute,
+    compute=of_cohort("correlations", component_correlations),
     shown=("correlations",),
     tabulate=lambda table: table_of(table, COLUMNS),
     plot=plot_correlations,

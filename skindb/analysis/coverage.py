@@ -12,7 +12,7 @@ from xarray import Dataset
 
 from skindb import plots
 from skindb.analysis.contrasts import FEW
-from skindb.analysis.study import Population, Results, Study, skipped_takes, table_of
+from skindb.analysis.study import Study, of_cohort, skipped_takes, table_of
 from skindb.analysis.subjects import (
     AGE,
     CONDITION,
@@ -287,17 +287,12 @@ class Parameters:
     """The study of coverage has no parameters."""
 
 
-def compute(population: Population, _: Parameters) -> Results:
-    """The results of the study."""
-    return {"coverage": coverage_report(population.cohort)}
-
-
 STUDY = Study(
     name="coverage",
     description="number of subjects by skin type, gender and age",
     layout="tables",
     parameters=Parameters,
-    compute=compute,
+    compute=of_cohort("coverage", coverage_report),
     shown=("coverage",),
     tabulate=lambda report: table_of(report, [variables.COVERAGE_COUNT]),
     plot=plot_coverage,

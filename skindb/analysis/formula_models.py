@@ -30,14 +30,7 @@ from skindb.analysis.formulas import (
 from skindb.analysis.long_form import COLUMNS as VALUES
 from skindb.analysis.long_form import INTERCEPT, tidy
 from skindb.analysis.quantities import quantities_of
-from skindb.analysis.study import (
-    Population,
-    Results,
-    Study,
-    Table,
-    skipped_takes,
-    table_of,
-)
+from skindb.analysis.study import Study, Table, of_cohort, skipped_takes, table_of
 from skindb.analysis.subjects import CONDITION, NORMAL
 from skindb.errors import InputError, input_error, require
 from skindb.numerics.statistics import ROUNDING
@@ -619,17 +612,12 @@ class Parameters:
     )
 
 
-def compute(population: Population, parameters: Parameters) -> Results:
-    """The results of the study."""
-    return {"linear_model": linear_model(population.cohort, **vars(parameters))}
-
-
 STUDY = Study(
     name="model",
     description="effects of attributes, conditions and visits by a formula",
     layout="tables",
     parameters=Parameters,
-    compute=compute,
+    compute=of_cohort("linear_model", linear_model),
     shown=("linear_model",),
     tabulate=tabulate_model,
     plot=plot_model,

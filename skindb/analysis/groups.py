@@ -19,18 +19,10 @@ from skindb.analysis.contrasts import (
     Comparison,
     Contrast,
     compare_groups,
-    contrast_arguments,
     contrast_counts,
 )
 from skindb.analysis.quantities import SURFACE, Quantities, quantities_of
-from skindb.analysis.study import (
-    Population,
-    Results,
-    Study,
-    Table,
-    skipped_takes,
-    table_of,
-)
+from skindb.analysis.study import Study, Table, of_cohort, skipped_takes, table_of
 from skindb.analysis.subjects import notes_on_attributes, subjects_of
 from skindb.errors import InputError, few_names
 from skindb.numerics.inference import Effects
@@ -418,19 +410,12 @@ def tabulate_group_effects(table: Dataset) -> Table:
     return table_of(table.assign(counts), names, ("contrast", "quantity"))
 
 
-def compute(population: Population, parameters: ContrastParameters) -> Results:
-    """The results of the study."""
-    return {
-        "effects": group_effects(population.cohort, **contrast_arguments(parameters))
-    }
-
-
 STUDY = Study(
     name="groups",
     description="differences between groups of subjects, with intervals and p values",
     layout="tables",
     parameters=ContrastParameters,
-    compute=compute,
+    compute=of_cohort("effects", group_effects),
     shown=("effects",),
     tabulate=tabulate_group_effects,
     plot=plot_group_effects,

@@ -15,7 +15,6 @@ from skindb.analysis.contrasts import (
     MIN_RELIABILITY,
     Comparison,
     compare_groups,
-    contrast_arguments,
 )
 from skindb.analysis.groups import SIGNIFICANT
 from skindb.analysis.quantities import (
@@ -28,11 +27,10 @@ from skindb.analysis.quantities import (
     is_relative,
 )
 from skindb.analysis.study import (
-    Population,
-    Results,
     Study,
     Table,
     each_take,
+    of_cohort,
     skipped_takes,
     table_of,
 )
@@ -389,18 +387,12 @@ class Parameters(ContrastParameters):
     permutations: int = permutations_option(PERMUTATIONS)
 
 
-def compute(population: Population, parameters: Parameters) -> Results:
-    """The results of the study."""
-    maps = effect_maps(population.cohort, **contrast_arguments(parameters))
-    return {"effect_maps": maps}
-
-
 STUDY = Study(
     name="maps",
     description="differences between groups at every texel of the common (u, v)",
     layout="maps",
     parameters=Parameters,
-    compute=compute,
+    compute=of_cohort("effect_maps", effect_maps),
     shown=("effect_maps",),
     tabulate=tabulate_effect_maps,
     plot=plot_effect_maps,

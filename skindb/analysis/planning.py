@@ -26,7 +26,7 @@ from skindb.analysis.formulas import (
     sum_of,
 )
 from skindb.analysis.long_form import INTERCEPT
-from skindb.analysis.study import Population, Results, Study, table_of
+from skindb.analysis.study import Study, of_cohort, table_of
 from skindb.errors import require
 from skindb.parameters import option, require_limits
 from skindb.schema import dataset, variables
@@ -245,17 +245,12 @@ class Parameters:
     )
 
 
-def compute(population: Population, parameters: Parameters) -> Results:
-    """The results of the study."""
-    return {"plan": sample_sizes(population.cohort, **vars(parameters))}
-
-
 STUDY = Study(
     name="plan",
     description="numbers of subjects that a study needs, from the variances of repeats",
     layout="tables",
     parameters=Parameters,
-    compute=compute,
+    compute=of_cohort("plan", sample_sizes),
     shown=("plan",),
     tabulate=lambda table: table_of(table, COLUMNS, ("quantity",)),
     plot=plot_plan,

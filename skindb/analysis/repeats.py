@@ -13,14 +13,7 @@ from xarray import Dataset
 
 from skindb import plots
 from skindb.analysis.quantities import NORMAL_95, Quantities, quantities_of
-from skindb.analysis.study import (
-    Population,
-    Results,
-    Study,
-    Table,
-    skipped_takes,
-    table_of,
-)
+from skindb.analysis.study import Study, Table, of_cohort, skipped_takes, table_of
 from skindb.analysis.subjects import CONDITION, NORMAL, subjects_of
 from skindb.errors import require
 from skindb.numerics.statistics import (
@@ -200,22 +193,12 @@ class Parameters:
     quantities: tuple[str, ...] = quantities_option()
 
 
-def compute(population: Population, parameters: Parameters) -> Results:
-    """The results of the study."""
-    table = repeatability(
-        population.cohort,
-        condition=parameters.condition,
-        quantities=parameters.quantities,
-    )
-    return {"repeatability": table}
-
-
 STUDY = Study(
     name="repeatability",
     description="reliability and repeatability of quantities, from repeated takes",
     layout="tables",
     parameters=Parameters,
-    compute=compute,
+    compute=of_cohort("repeatability", repeatability),
     shown=("repeatability",),
     tabulate=tabulate_repeatability,
     plot=plot_repeatability,

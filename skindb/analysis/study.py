@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import wraps
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
@@ -190,6 +191,24 @@ class Study:
     def registers(self) -> bool:
         """Whether it reads registrations: maps exist of registered takes only."""
         return self.uses_registration or self.layout == "maps"
+
+
+def of_cohort(
+    group: str, function: Callable[..., Dataset]
+) -> Callable[[Population, Any], Results]:
+    """What a study computes with one function of its cohort, whose keyword arguments are
+    the parameters, with a generator ``rng`` in place of a seed. The digest of its code
+    is that of the function.
+    """
+
+    @wraps(function)
+    def results_of(population: Population, parameters: Any) -> Results:
+        arguments = dict(vars(parameters))
+        if "seed" in arguments:
+            arguments["rng"] = np.random.default_rng(arguments.pop("seed"))
+        return {group: function(population.cohort, **arguments)}
+
+    return results_of
 
 
 def table_of(

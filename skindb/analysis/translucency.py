@@ -11,7 +11,7 @@ from xarray import Dataset
 from skindb import plots
 from skindb.analysis.contrasts import FEW
 from skindb.analysis.quantities import trusted, within_deviation
-from skindb.analysis.study import Population, Results, Study, table_of
+from skindb.analysis.study import Study, of_cohort, table_of
 from skindb.analysis.subjects import Groups, grouped
 from skindb.errors import require
 from skindb.numerics.statistics import SUMMARY, known_mean
@@ -191,18 +191,12 @@ class Parameters:
     group_by: str | None = group_option()
 
 
-def compute(population: Population, parameters: Parameters) -> Results:
-    """The results of the study."""
-    table = translucency_table(population.cohort, group_by=parameters.group_by)
-    return {"translucency_table": table}
-
-
 STUDY = Study(
     name="translucency",
     description="translucency by site of the face",
     layout="tables",
     parameters=Parameters,
-    compute=compute,
+    compute=of_cohort("translucency_table", translucency_table),
     shown=("translucency_table",),
     tabulate=lambda table: table_of(table, COLUMNS),
     plot=plot_translucency,

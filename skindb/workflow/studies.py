@@ -23,7 +23,7 @@ from skindb.analysis.quantities import SPACING, spacing_notes
 from skindb.analysis.regions import common_landmarks
 from skindb.analysis.registration import describe_registration
 from skindb.analysis.studies import STUDIES
-from skindb.analysis.study import Population, Study
+from skindb.analysis.study import Population, Study, of_cohort
 from skindb.analysis.subjects import (
     CONDITION,
     describe_visits,
@@ -557,7 +557,7 @@ def _derivation(
         STUDY,
         key,
         inputs=inputs,
-        code=[record.compute, open_population],
+        code=[record.compute, of_cohort, open_population],
         names=names,
         parameters={"what": record.name, **requested},
         seeds={"analyze": requested["seed"]} if "seed" in requested else {},

@@ -13,6 +13,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from skindb.analysis.planning import sample_sizes
+from skindb.analysis.studies import STUDIES
+from skindb.analysis.study import of_cohort
 from skindb.files import cache_folder, package_digest
 from skindb.fit.model import second_pass
 from skindb.schema import dataset
@@ -165,6 +168,12 @@ def test_code_digest__takes_the_function_of_a_partial_and_around_a_nested_one(pa
     called.func.__module__ = FIT.__module__
     called.func.__qualname__ = FIT.__qualname__
     assert code_digest(FIT) == code_digest(nested) == code_digest(called)
+
+
+def test_code_digest__of_a_study_is_that_of_its_function():
+    computed = [study.compute for study in STUDIES.values()]
+    assert code_digest(of_cohort("plan", sample_sizes)) == code_digest(sample_sizes)
+    assert len({code_digest(compute) for compute in computed}) == len(STUDIES)
 
 
 def test_code_digest__refuses_functions_of_other_packages():
