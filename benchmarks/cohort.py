@@ -88,7 +88,7 @@ def truth_of(path: Path, cohort: xr.Dataset) -> xr.Dataset:
             "region_glossiness": (("region",), regions[:, 4] / regions[:, 3]),
             "site_sigma_tr": (("site", "channel"), probed),
         }
-        | {name: rough[name].drop_vars(rough.coords) for name in ROUGH}
+        | {name: rough[name].reset_coords(drop=True) for name in ROUGH}
     )
 
 

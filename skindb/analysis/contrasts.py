@@ -16,6 +16,7 @@ from scipy.special import gammaln
 from xarray import Dataset
 
 from skindb.analysis.quantities import (
+    GLOSSINESS,
     NORMAL_95,
     SURFACE,
     Quantities,
@@ -55,6 +56,9 @@ from skindb.types import Array, finite_rows
 # below which a quantity shows errors more than subjects or their changes ("poor" in Koo
 # and Li 2016), and has no p values
 MIN_RELIABILITY = 0.5
+# change of quantities of the surface by light that highlights lack, a fraction of all light:
+# its glossiness may differ by 0.4 from that of the 0.04 which skin reflects
+LACKING = {SURFACE: 1.0, GLOSSINESS.name: 10.0}
 # subjects of a group, below which intervals depend on the assumption of normal values
 FEW = 10
 # multiple correlation from which an attribute counts as confounder: a quarter of the
@@ -342,8 +346,14 @@ def _even_error(
     is_same = np.isclose(*both)
     change = float((second - first)[:, 1].mean())
     error = np.hypot(np.where(is_same, 0.0, np.hypot(*both)).mean(), change)
-    is_surface = np.char.startswith(quantities.names, SURFACE)
-    lacking = np.where(is_surface, NORMAL_95 * abs(change), 0.0)
+    lacking = (
+        NORMAL_95
+        * abs(change)
+        * sum(
+            factor * np.char.startswith(quantities.names, name)
+            for name, factor in LACKING.items()
+        )
+    )
     common = np.multiply(quantities.common, error / max(largest, ROUNDING))
     return np.asarray(np.hypot(common, lacking))
 

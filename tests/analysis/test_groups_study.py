@@ -439,9 +439,9 @@ def _unlike_surfaces(after, change):
     error = np.repeat([0.01, after], 20)
     cohort = cohort.assign_coords(fit_even_reflection_error=("take", error))
     cohort["region_surface_reflectance"][20:] += 0.01
-    return _compare(
-        cohort, "condition", quantities=["R_d", "ITA", "surface reflectance"]
-    ).isel(contrast=0)
+    cohort["region_glossiness"] = cohort["region_surface_reflectance"] + 0.6
+    names = ["R_d", "ITA", "surface reflectance", "glossiness"]
+    return _compare(cohort, "condition", quantities=names).isel(contrast=0)
 
 
 @pytest.mark.parametrize(
@@ -469,6 +469,10 @@ def test_group_effects__of_conditions_contain_even_reflection(
     surface = found.sel(quantity="surface reflectance face")
     assert surface["effect_high"] - surface["effect_low"] > 2 * 1.96 * 0.002
     assert surface["effect_p"] < 0.01
+    # the same change of glossiness is less than such light may cause
+    glossiness = found.sel(quantity="glossiness face")
+    assert glossiness["effect_high"] - glossiness["effect_low"] > 20 * 1.96 * 0.002
+    assert np.isnan(glossiness["effect_p"])
     assert np.isnan(found["effect_p"].sel(quantity="ITA face")) == is_withheld
     flags = " ".join(found.attrs["flags"])
     assert ("where even reflection may cause the effect: R_d" in flags) == is_withheld
