@@ -9,8 +9,9 @@ from dask.system import cpu_count
 from xarray import Dataset, apply_ufunc
 
 from skindb.schema import VARIABLES, label
+from skindb.types import AnyArray
 
-Kernel = Callable[..., tuple[np.ndarray[Any, Any], ...]]
+Kernel = Callable[..., tuple[AnyArray, ...]]
 
 
 def elementwise(
@@ -51,7 +52,7 @@ def elementwise(
     specs = [VARIABLES[name] for name in outputs]
     lengths = {str(dim): size for dim, size in ds.sizes.items()} | dict(sizes or {})
 
-    def declared(*blocks: np.ndarray[Any, Any]) -> Any:
+    def declared(*blocks: AnyArray) -> Any:
         # convert the results of the kernel to the dtype of the schema, which the lazy
         # array declares
         results = kernel(*blocks, **params)

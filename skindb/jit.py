@@ -17,10 +17,9 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils, event
 from numba.extending import intrinsic, overload
-from numpy.typing import NDArray
 
 from skindb.kernel_compiler import Kernel
-from skindb.types import Matrix32, Vector, Vector32
+from skindb.types import AnyArray, Matrix32, Vector, Vector32
 
 # a kernel keeps its signature for mypy, which checks its callers
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -282,7 +281,7 @@ def _single(value: Any) -> Any:
     return lambda value: value
 
 
-def sample_bits(sample: NDArray[Any]) -> NDArray[Any]:
+def sample_bits(sample: AnyArray) -> AnyArray:
     """Half floats as uint16 bits, because Numba has no half type; other samples in
     single precision.
     """
@@ -292,7 +291,7 @@ def sample_bits(sample: NDArray[Any]) -> NDArray[Any]:
 
 
 @kernel
-def unpack(sample: NDArray[Any], out: Vector32) -> None:
+def unpack(sample: AnyArray, out: Vector32) -> None:
     """Write the samples (lights, cameras, 3) of a surfel to `out` (lights cameras 3,)
     in single precision.
     """

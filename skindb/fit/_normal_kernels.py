@@ -5,10 +5,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.jit import all_finite, kernel
 from skindb.optics._photometric_kernels import (
@@ -17,7 +15,7 @@ from skindb.optics._photometric_kernels import (
     estimate_normal,
     normal_estimates,
 )
-from skindb.types import Matrix, Vector
+from skindb.types import AnyArray, Matrix, Vector
 
 # Terms of the total error that cover 91 to 96 % of the normals of six independent
 # captures with known truth: shadows, folds and residual highlights affect neighbouring
@@ -109,7 +107,7 @@ def _total_error(error: float, normal: Matrix) -> float:
 
 @kernel
 def normals_block(
-    sample: NDArray[Any],
+    sample: AnyArray,
     position: Matrix,
     light: Matrix,
     camera: Matrix,

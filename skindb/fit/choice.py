@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.fit.albedo import estimate_in_sequence
 from skindb.fit.corrections import (
@@ -26,7 +25,7 @@ from skindb.fit.quality import HELD_OUT_ERRORS
 from skindb.fit.surface import fit_surface, held_out_error
 from skindb.parameters import FitParameters
 from skindb.schema import dataset
-from skindb.types import Array
+from skindb.types import Array, Index, Mask
 
 CORRECTIONS = ("light_gains", "inter_reflection")
 STREAM = 3  # of random numbers
@@ -74,8 +73,8 @@ class Trial:
 
     capture: xr.DataTree
     samples: xr.Dataset  # of all surfels, training lights and cameras only
-    lights: NDArray[np.intp]  # their indices in the capture
-    surfels: NDArray[np.intp]  # indices of the sample
+    lights: Index  # their indices in the capture
+    surfels: Index  # indices of the sample
     held_out: xr.Dataset
     parameters: FitParameters
 
@@ -267,7 +266,7 @@ def _tried(
 def _changes(
     before: dict[str, Array],
     after: dict[str, Array],
-    chosen: NDArray[np.bool_] | None = None,
+    chosen: Mask | None = None,
 ) -> dict[str, Change]:
     """Change of the errors at lights and at cameras, a mean over surfels."""
     changes = {}
@@ -292,7 +291,7 @@ def _word(good: bool) -> str:
     return "on" if good else "off"
 
 
-def _rms(values: NDArray[np.floating]) -> Array:
+def _rms(values: Array) -> Array:
     """RMS (surfel,) of the finite samples (surfel, light, camera, channel); 0 without any."""
     finite = np.isfinite(values)
     square = np.square(np.where(finite, values, 0), dtype=np.float64).sum(
@@ -301,7 +300,7 @@ def _rms(values: NDArray[np.floating]) -> Array:
     return np.asarray(np.sqrt(square / np.maximum(finite.sum(axis=(1, 2, 3)), 1)))
 
 
-def _drawn(count: int, rng: np.random.Generator) -> NDArray[np.bool_]:
+def _drawn(count: int, rng: np.random.Generator) -> Mask:
     """A random fraction of lights or cameras."""
     held = np.zeros(count, np.bool_)
     held[rng.permutation(count)[: max(1, round(HELD_OUT_FRACTION * count))]] = True

@@ -11,14 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.fit.lumitexels import POLARISATION, cosines, directions
 from skindb.geometry.interreflection import bounce_transfer, tangent_frames
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.schema import check, dataset
-from skindb.types import Array
+from skindb.types import AnyArray, Array, Float32, Index
 
 # surfels in a camera that are used: twice as many changed gains by 0.1 to 0.4 %, at
 # most 2.2 %
@@ -350,7 +349,7 @@ class _View(NamedTuple):
     camera: int
     cosine: float  # to the camera
     shading: Sequence[Array]  # (light, SMOOTH) for each set of positions of the lights
-    lights: NDArray[np.intp]
+    lights: Index
 
 
 def _views(few: xr.Dataset, lights: Sequence[Array], *, eta: float) -> Iterator[_View]:
@@ -399,7 +398,7 @@ def _smooth(columns: Array, seen: Array) -> Array | None:
 
 
 def _add_view(
-    sample: Array, shading: Sequence[Array], at: NDArray[np.intp], matrix: Array
+    sample: Array, shading: Sequence[Array], at: Index, matrix: Array
 ) -> None:
     """Add to `matrix` the squared residuals of a smooth function for the samples of
     lights `at`; `shading` (light, SMOOTH) for each set of positions.
@@ -449,13 +448,13 @@ def _shading(direction: Array, eta: float) -> Array:
 
 def bounced_light(
     lumitexels: xr.Dataset,
-    diffuse: NDArray[Any],
-    visible: NDArray[Any],
-    triangles: NDArray[Any],
+    diffuse: AnyArray,
+    visible: AnyArray,
+    triangles: AnyArray,
     *,
     eta: float = 1.3,
-    receivers: NDArray[np.intp] | slice = slice(None),
-) -> NDArray[np.float32]:
+    receivers: Index | slice = slice(None),
+) -> Float32:
     """Light that reaches each surfel after one diffuse reflection elsewhere, relative
     to the direct light facing it.
 
@@ -530,8 +529,8 @@ def _square_distance(points: Array, light: Array) -> Array:
 
 def without_bounce(
     lumitexels: xr.Dataset,
-    bounced: NDArray[np.float32],
-    diffuse: NDArray[Any],
+    bounced: Float32,
+    diffuse: AnyArray,
     *,
     eta: float = 1.3,
 ) -> xr.Dataset:

@@ -9,15 +9,14 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.parameters import SCAN_ERROR_DEGREES
 from skindb.reflectance.model import Block, Noise, typical_noise
 from skindb.schema import check, variables
-from skindb.types import Array
+from skindb.types import AnyArray, Array
 
-Arrays = Mapping[str, NDArray[Any]]  # of a block of surfels, by variable
+Arrays = Mapping[str, AnyArray]  # of a block of surfels, by variable
 GEOMETRY = (
     "reflectance_sample",
     "surfel_position",
@@ -190,7 +189,7 @@ def noise_of(arrays: Arrays, typical: Noise) -> Noise:
 
 
 def sample_variance(
-    lumitexels: xr.Dataset, reflectance: NDArray[Any] | None = None
+    lumitexels: xr.Dataset, reflectance: AnyArray | None = None
 ) -> xr.DataArray:
     """Variance (surfel, light, camera, channel) [sr^-2] of samples due to photons, read
     noise and quantisation.

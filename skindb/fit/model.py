@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from dask.callbacks import Callback
-from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.fit.albedo import estimate_in_sequence
@@ -44,7 +43,7 @@ from skindb.schema.cohort import EVEN
 from skindb.schema.consent import honour_consent
 from skindb.schema.label import take_attrs
 from skindb.threads import on_one_blas_thread
-from skindb.types import Progress
+from skindb.types import Float64, Progress
 
 COMPILING = "compiling, only after an installation"
 COPIED_GROUPS = ("mesh", "dome", "probe")
@@ -361,7 +360,7 @@ def _direct_light(
     )
 
 
-def _with_gains(dome: xr.Dataset, gain: NDArray[np.float64]) -> xr.Dataset:
+def _with_gains(dome: xr.Dataset, gain: Float64) -> xr.Dataset:
     """The dome with intensities multiplied by the gains, for renderings that are
     compared with photographs.
     """

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.fit.lumitexels import disc_angle, lumitexels, relative_reflectance
@@ -16,7 +15,7 @@ from skindb.reflectance.kinds import unfitted_model
 from skindb.reflectance.model import FitRequest, ReflectanceModel
 from skindb.schema import dataset
 from skindb.schema.notes import Omission
-from skindb.types import Mask
+from skindb.types import Index, Mask
 
 RELATIVE = "no white target: R_d is relative to an unknown factor per channel"
 
@@ -205,7 +204,7 @@ def fitted_part(lumitexels: xr.Dataset, held_out: xr.Dataset) -> xr.Dataset:
 
 def _drawn(
     capture: xr.DataTree, dim: str, useful: Mask, fraction: float, seed: list[int]
-) -> NDArray[np.intp]:
+) -> Index:
     """Indices of the useful lights or cameras that are held out: at least one if any, never all."""
     count = int(useful.sum())
     if fraction and count < 2:

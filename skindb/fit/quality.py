@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.reflectance._lumitexel_kernels import BINS_PER_SCALE
 from skindb.schema import FitStatus, check, dataset, variables
 from skindb.schema.label import FACE
+from skindb.types import AnyArray, Float64, Mask
 
 HELD_OUT_ERRORS = {
     "light": ("held_out_error", "held_out_error_perceptual"),
@@ -179,7 +179,7 @@ def _row(one: xr.Dataset) -> dict[str, Any]:
     return row
 
 
-def _values(fitted: xr.Dataset, name: str) -> NDArray[Any]:
+def _values(fitted: xr.Dataset, name: str) -> AnyArray:
     return (
         fitted[name].values
         if name in fitted
@@ -187,7 +187,7 @@ def _values(fitted: xr.Dataset, name: str) -> NDArray[Any]:
     )
 
 
-def _regions(fitted: xr.Dataset) -> dict[str, NDArray[Any]]:
+def _regions(fitted: xr.Dataset) -> dict[str, AnyArray]:
     """Indices of the surfels of the face and of each non-empty region."""
     regions = {FACE: np.arange(fitted.sizes["surfel"])}
     if "region_mask" in fitted:
@@ -201,7 +201,7 @@ def _regions(fitted: xr.Dataset) -> dict[str, NDArray[Any]]:
     return regions
 
 
-def _quantiles(values: NDArray[Any], area: NDArray[Any]) -> NDArray[Any]:
+def _quantiles(values: AnyArray, area: AnyArray) -> AnyArray:
     """Area-weighted quantiles; NaN without values that have an area."""
     finite = np.isfinite(values) & (area > 0)
     if not finite.any():
@@ -215,7 +215,7 @@ def _quantiles(values: NDArray[Any], area: NDArray[Any]) -> NDArray[Any]:
     return np.asarray(quantiles)
 
 
-def _mean(values: NDArray[Any], area: NDArray[Any]) -> float:
+def _mean(values: AnyArray, area: AnyArray) -> float:
     finite = np.isfinite(values) & (area > 0)
     return (
         float(np.average(values[finite], weights=area[finite]))
@@ -242,7 +242,7 @@ NEIGHBOURS = 4  # lights with similar angles, and thus similar misfit
 MIN_SAMPLES_MISFIT = 1000
 
 
-def misfits(frames: NDArray[Any]) -> dict[str, NDArray[Any]]:
+def misfits(frames: AnyArray) -> dict[str, AnyArray]:
     """Variables of lights, cameras and photographs from histograms (lights, cameras,
     bins) of scaled residuals.
     """
@@ -287,7 +287,7 @@ def suspects(outliers: xr.Dataset, lumitexels: xr.Dataset) -> list[dict[str, Any
     return sorted(devices, key=lambda one: -one["misfit"])
 
 
-def _moved_cameras(outliers: xr.Dataset) -> NDArray[np.bool_]:
+def _moved_cameras(outliers: xr.Dataset) -> Mask:
     """Cameras with a misfit under nearly all lights; by the misfit of all samples if
     few photographs are usable.
     """
@@ -304,12 +304,12 @@ def _moved_cameras(outliers: xr.Dataset) -> NDArray[np.bool_]:
     return moved
 
 
-def _usual(misfit: xr.DataArray) -> NDArray[Any]:
+def _usual(misfit: xr.DataArray) -> AnyArray:
     """Median of three or more values, else NaN, as two values cannot be compared."""
     return np.asarray(misfit.median() if misfit.count() > 2 else np.inf)
 
 
-def _around(outliers: xr.Dataset, position: NDArray[Any]) -> NDArray[Any]:
+def _around(outliers: xr.Dataset, position: AnyArray) -> AnyArray:
     """Usual misfit at each light: the larger of the medians of its neighbours and of all lights."""
     misfit = outliers["light_misfit"].values
     distance = np.linalg.norm(position[:, None].astype(np.float64) - position, axis=-1)
@@ -321,14 +321,14 @@ def _around(outliers: xr.Dataset, position: NDArray[Any]) -> NDArray[Any]:
     )
 
 
-def _beyond(counts: NDArray[Any]) -> NDArray[Any]:
+def _beyond(counts: AnyArray) -> AnyArray:
     total = counts.sum(-1)
     return np.where(
         total >= MIN_SAMPLES_MISFIT, counts[..., -1] / np.maximum(total, 1), np.nan
     )
 
 
-def _median(counts: NDArray[Any]) -> NDArray[Any]:
+def _median(counts: AnyArray) -> AnyArray:
     """Medians of histograms (..., bins) of scaled residuals relative to normal noise;
     NaN for too few samples.
 
@@ -358,7 +358,7 @@ MIN_RESIDUAL = 0.1
 MAX_RELATIVE_R_D = 0.7
 
 
-def find_obstructed(fitted: xr.Dataset) -> NDArray[np.bool_]:
+def find_obstructed(fitted: xr.Dataset) -> Mask:
     """Whether something in front of a surfel hides its skin, as hair does.
 
     Such surfels have large residuals, as no reflectance of a surface explains the
@@ -398,7 +398,7 @@ ERROR_PER_RESIDUAL = 1.5
 TIMES_EXPLAINED_RESIDUAL = 1.5
 
 
-def error_of_misfit(fitted: xr.Dataset) -> NDArray[np.float64]:
+def error_of_misfit(fitted: xr.Dataset) -> Float64:
     """Standard error of R_d where the residual is larger than a surface explains, as
     beside hair, whose strands and shadows are no reflectance.
 
@@ -423,7 +423,7 @@ def error_of_misfit(fitted: xr.Dataset) -> NDArray[np.float64]:
     return np.asarray(ERROR_PER_RESIDUAL * unexplained[:, None] * colour)
 
 
-def _dictionary_residual(fitted: xr.Dataset) -> NDArray[np.float64]:
+def _dictionary_residual(fitted: xr.Dataset) -> Float64:
     """Relative residual of the fit by the dictionary, or else of the fit."""
     name = "dictionary_residual" if "dictionary_residual" in fitted else "fit_residual"
     return np.asarray(fitted[name].values, np.float64)

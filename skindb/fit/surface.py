@@ -12,7 +12,6 @@ import numpy as np
 import xarray as xr
 from dask.base import compute
 from dask.delayed import delayed
-from numpy.typing import NDArray
 
 from skindb.elementwise import elementwise
 from skindb.fit.lumitexels import (
@@ -34,7 +33,7 @@ from skindb.reflectance.model import (
     SurfaceFit,
 )
 from skindb.schema import check, dataset, text_labels, variables
-from skindb.types import Array
+from skindb.types import AnyArray, Array, Index
 
 NEEDED = (*GEOMETRY, "shading_normal", "diffuse_reflectance")
 # sr^-1; noise of a sample of dark skin by photons and resampling; that of the sensor may be larger
@@ -274,7 +273,7 @@ class _Judged(NamedTuple):
     """Variables of the surfels, and histograms (lights, cameras, bins) of residuals."""
 
     surfels: xr.Dataset
-    counts: NDArray[np.int64]
+    counts: Index
 
 
 def _judged(
@@ -286,7 +285,7 @@ def _judged(
     min_samples: int = MIN_SAMPLES_GLOSS,
     min_width: float = MIN_LOBE_WIDTH,
     evaluate: bool = False,
-    held: NDArray[np.int64] | None = None,
+    held: Index | None = None,
     outliers: bool = False,
 ) -> _Judged:
     """Fit or only evaluate the parameters of the surfels, block by block.
@@ -302,7 +301,7 @@ def _judged(
     comparison = Comparison(mode, eta, noise_floor(lumitexels), min_samples, min_width)
     noise = take_noise(lumitexels)
 
-    def judge(part: xr.Dataset) -> tuple[dict[str, Array], NDArray[np.int64]]:
+    def judge(part: xr.Dataset) -> tuple[dict[str, Array], Index]:
         arrays = {name: part[name].values for name in names}
         diffuse_error = arrays.get("diffuse_reflectance_error")
         if diffuse_error is None and not evaluate:
@@ -345,9 +344,9 @@ def _error_columns(judged: SurfaceFit, judgement: Judgement) -> dict[str, Array]
 
 
 def joined_blocks(
-    judge: Callable[[xr.Dataset], tuple[Any, NDArray[Any]]],
+    judge: Callable[[xr.Dataset], tuple[Any, AnyArray]],
     blocks: Sequence[xr.Dataset],
-) -> tuple[list[Any], NDArray[Any]]:
+) -> tuple[list[Any], AnyArray]:
     """Results of `judge` for each block, and the sum of the histograms that it also returns.
 
     Histograms are added in pairs as blocks finish: those of a full dome take 1.5 MB per

@@ -4,17 +4,14 @@ no list of neighbours.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.jit import kernel
-from skindb.types import BoolVector
+from skindb.types import AnyArray, BoolVector
 
 
 @kernel
-def grown(faces: NDArray[Any], mask: BoolVector) -> BoolVector:
+def grown(faces: AnyArray, mask: BoolVector) -> BoolVector:
     """Mask (n,) extended by all vertices that share an edge with a vertex of the mask,
     by triangles (f, 3).
     """
@@ -27,7 +24,7 @@ def grown(faces: NDArray[Any], mask: BoolVector) -> BoolVector:
 
 
 @kernel
-def mixed(faces: NDArray[Any], mask: BoolVector) -> BoolVector:
+def mixed(faces: AnyArray, mask: BoolVector) -> BoolVector:
     """Vertices (n,) that share an edge with a vertex of another mask value, by triangles (f, 3)."""
     out = np.zeros(len(mask), np.bool_)
     for k in range(len(faces)):

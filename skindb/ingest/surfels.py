@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from skindb.errors import require
@@ -33,7 +32,7 @@ from skindb.geometry.mesh import (
 )
 from skindb.geometry.rays import RayScene
 from skindb.schema.label import FACE
-from skindb.types import Float32, Float64, Index, Mask, dots, float64, lengths
+from skindb.types import Float32, Float64, Half, Index, Mask, dots, float64, lengths
 
 MAX_SURFELS = 2_500_000  # the samples of this many surfels in a full dome take 36 GB
 # mm; a landmark that is farther from the cropped than from the complete scan by this
@@ -43,7 +42,6 @@ NECK_STRIP_HALF_WIDTH_MM = 15.0  # mm; half width of the strip at the front of t
 # nodes, 4 mm apart on a face, and those whose lobes are blended, within about 8 mm
 BLEND_NODES = 4000
 BLENDED = 13
-Half = NDArray[np.float16]
 VisibilityTest = Callable[[Index], Mask]  # surfels (m,) that face an eye -> (m,)
 # points of a light's disc besides its centre; each stands for a fifth of its area
 RING_POINTS = 4

@@ -48,6 +48,7 @@ from skindb.store.record import (
     subjects_of,
 )
 from skindb.store.verified import Committed, Manifest, read_beside
+from skindb.types import AnyArray
 
 MIN_CHUNK_SURFELS = 256  # in a chunk, the smallest unit of reading
 MIN_CHUNK_BYTES = 1 << 19  # a smaller chunk gets more surfels
@@ -430,7 +431,7 @@ def _whole_shards(ds: Dataset) -> Dataset:
     return ds
 
 
-def _shards(values: np.ndarray[Any, Any], rows: int) -> Any:
+def _shards(values: AnyArray, rows: int) -> Any:
     """An array as lazy shards; `dask.array.from_array` would copy a memory-mapped file
     into memory.
     """
@@ -440,7 +441,7 @@ def _shards(values: np.ndarray[Any, Any], rows: int) -> Any:
     starts = range(0, len(values), rows)
     sizes = tuple(len(values[start : start + rows]) for start in starts)
 
-    def shard(block_info: Any = None) -> np.ndarray[Any, Any]:
+    def shard(block_info: Any = None) -> AnyArray:
         (begin, end), *_ = block_info[None]["array-location"]
         return values[begin:end]
 
