@@ -127,6 +127,12 @@ class InputError(ValueError):
         return InputError, (self.faults,)
 
 
+class UnavailableError(InputError):
+    """A database does not answer or refuses access, so that its contents are unknown but
+    not known to be damaged.
+    """
+
+
 def input_error(where: str, rule: str, found: str, cure: str = "") -> InputError:
     """An `InputError` with one fault."""
     return InputError(Fault(where, rule, found, cure))
@@ -143,12 +149,15 @@ def require(
 def attempt(
     faults: list[Fault], call: Callable[[], T], *, where: str = "{}"
 ) -> T | None:
-    """Result of a call; None if it raises an `InputError`, whose faults are then recorded.
+    """Result of a call; None if it raises an `InputError`, whose faults are then recorded,
+    except for an `UnavailableError`.
 
     In `where`, the place of each fault, {} stands for the place that the fault names.
     """
     try:
         return call()
+    except UnavailableError:
+        raise
     except InputError as error:
         faults += [replace(f, where=where.replace("{}", f.where)) for f in error.faults]
         return None

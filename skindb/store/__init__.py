@@ -2,6 +2,7 @@
 package imports zarr.
 """
 
+from skindb.errors import UnavailableError
 from skindb.store.archive import State, backup_states
 from skindb.store.audit import AuditEntry
 from skindb.store.backup import BackupReport
@@ -18,7 +19,6 @@ from skindb.store.place import (
     RELEASE,
     STUDY,
     SUMMARY,
-    UnavailableError,
     require_text,
     subject_of,
 )

@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import TypeVar
 
-from skindb.errors import Fault, InputError, input_error, require
+from skindb.errors import Fault, InputError, attempt, input_error, require
 from skindb.store.bucket import place_at
 from skindb.store.erasure import remainder_of
 from skindb.store.lease import Lease
@@ -42,7 +42,6 @@ from skindb.store.place import (
 from skindb.store.record import (
     DIGEST,
     Record,
-    collect_faults,
     damage_as_fault,
     record_from_json,
     require_format,
@@ -197,8 +196,7 @@ class Archive:
         """All readable states, and the faults of the others."""
         faults: list[Fault] = []
         states = [
-            collect_faults(partial(self.state, number), faults)
-            for number in self.numbers()
+            attempt(faults, partial(self.state, number)) for number in self.numbers()
         ]
         return [state for state in states if state is not None], faults
 
@@ -420,14 +418,14 @@ def intact(
     faults are added to `faults`.
     """
 
-    def attempt(value: T) -> tuple[R | None, list[Fault]]:
+    def read_one(value: T) -> tuple[R | None, list[Fault]]:
         damage: list[Fault] = []
-        return collect_faults(partial(function, value), damage), damage
+        return attempt(damage, partial(function, value)), damage
 
     values = list(values)
     read = []
     for value, (result, damage) in zip(
-        values, in_parallel(attempt, values, THREADS), strict=True
+        values, in_parallel(read_one, values, THREADS), strict=True
     ):
         faults += damage
         if result is not None:

@@ -18,21 +18,10 @@ from functools import partial
 from typing import Any, get_origin, get_type_hints
 
 from skindb import __version__
-from skindb.errors import Fault, InputError, input_error
+from skindb.errors import Fault, InputError, UnavailableError, attempt, input_error
 from skindb.store.markers import is_sealed, keyed_hash, keyed_seal, require_secret
-from skindb.store.place import (
-    AUDIT,
-    Place,
-    UnavailableError,
-    in_parallel,
-    subject_of,
-)
-from skindb.store.record import (
-    collect_faults,
-    damage_as_fault,
-    json_object,
-    require_format,
-)
+from skindb.store.place import AUDIT, Place, in_parallel, subject_of
+from skindb.store.record import damage_as_fault, json_object, require_format
 
 FORMAT = 1
 BLOCK = 1_000  # numbers in a folder
@@ -149,8 +138,8 @@ def read_audit(
     numbers: list[int] = []
     faults: list[Fault] = []
     for block in _blocks(place):
-        numbers += collect_faults(partial(_numbers, place, block), faults) or ()
-    secret = collect_faults(partial(require_secret, place), faults)
+        numbers += attempt(faults, partial(_numbers, place, block)) or ()
+    secret = attempt(faults, partial(require_secret, place))
     if secret is None:
         return [], faults
     entries: dict[int, AuditEntry] = {}

@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 from zarr.abc.store import ByteRequest, Store
 from zarr.core.buffer import Buffer, BufferPrototype
 
-from skindb.errors import InputError, input_error
+from skindb.errors import InputError, UnavailableError, input_error
 from skindb.files import cache_folder, make_private
 from skindb.limits import MAX_STORE_JSON_BYTES
 from skindb.store.folder import Folder
@@ -31,10 +31,10 @@ from skindb.store.place import (
     Digests,
     Guard,
     Place,
-    UnavailableError,
     digests_of,
     in_parallel,
     require_parts,
+    unguarded,
 )
 from skindb.store.s3 import (
     RETRY_TIMEOUT,
@@ -55,7 +55,7 @@ FETCH_BYTES = 1 << 23  # read at a time while a digest is computed
 
 
 class Bucket:
-    """A bucket or a prefix of it; see `place.Place`. Credentials are neither stored in
+    """A bucket or a prefix of it; see `place`. Credentials are neither stored in
     the object nor pickled.
 
     Parameters
@@ -260,16 +260,15 @@ class Bucket:
                     )
                     raise OSError(errno.EIO, finding, self.where(path))
 
-    def create(self, key: str, data: bytes, *, guard: Guard | None = None) -> bool:
+    def create(self, key: str, data: bytes, *, guard: Guard = unguarded) -> bool:
         """Write an object that must not exist yet; returns False and writes nothing if it exists.
 
         A guard is called before and after; if it raises the second time, the caller
         must remove the object.
         """
-        if guard is not None:
-            guard()
+        guard()
         created = self._create(key, data)
-        if guard is not None and created:
+        if created:
             guard()
         return created
 
@@ -305,21 +304,19 @@ class Bucket:
             self.where(key),
         )
 
-    def replace(self, key: str, data: bytes, *, guard: Guard | None = None) -> None:
+    def replace(self, key: str, data: bytes, *, guard: Guard = unguarded) -> None:
         """Write or replace a small object; it is removed if the guard raises after it
         was written.
         """
-        if guard is not None:
-            guard()
+        guard()
         self._put(self._path(key), data)
-        if guard is not None:
-            try:
-                guard()
-            except UnavailableError:
-                raise
-            except InputError:
-                self.remove(key)
-                raise
+        try:
+            guard()
+        except UnavailableError:
+            raise
+        except InputError:
+            self.remove(key)
+            raise
 
     def sweep(self) -> None:
         """Nothing: writers call their guards again after an object was written."""

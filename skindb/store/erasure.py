@@ -15,7 +15,7 @@ from itertools import chain
 from pathlib import Path
 from typing import TypeVar
 
-from skindb.errors import InputError, input_error
+from skindb.errors import InputError, UnavailableError, input_error
 from skindb.schema.consent import CONSENT
 from skindb.store.decisions import commit_release, require_subject
 from skindb.store.entries import catalogue_blocks_of
@@ -32,7 +32,6 @@ from skindb.store.place import (
     TAKE,
     TIME_HEX,
     Place,
-    UnavailableError,
     in_parallel,
     subject_of,
 )

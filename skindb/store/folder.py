@@ -24,6 +24,7 @@ from skindb.store.place import (
     Guard,
     digests_of,
     inside,
+    unguarded,
 )
 
 # below a version; zarr creates group/array/c and a folder for each dim except the last
@@ -38,7 +39,7 @@ TYPES = ((stat.S_ISDIR, "folder"), (stat.S_ISREG, "file"), (stat.S_ISLNK, "link"
 
 
 class Folder:
-    """A folder; see `place.Place`, and `place.inside` for its keys.
+    """A folder; see `place`, also for its keys.
 
     Parameters
     ----------
@@ -172,14 +173,14 @@ class Folder:
             flush_path(Path(folder), mode=folders)
         self._flush_parents(place)
 
-    def create(self, key: str, data: bytes, *, guard: Guard | None = None) -> bool:
+    def create(self, key: str, data: bytes, *, guard: Guard = unguarded) -> bool:
         """Write a file durably if it does not exist yet; returns False and writes
         nothing if it exists.
         """
         # a link fails if the name exists; it is the only atomic step of a commit
         return self._write(key, data, os.link, guard)
 
-    def replace(self, key: str, data: bytes, *, guard: Guard | None = None) -> None:
+    def replace(self, key: str, data: bytes, *, guard: Guard = unguarded) -> None:
         """Write or replace a small file atomically and durably."""
         self._write(key, data, os.replace, guard)
 
@@ -217,7 +218,7 @@ class Folder:
         key: str,
         data: bytes,
         step: Callable[[Path, Path], None],
-        guard: Guard | None,
+        guard: Guard,
     ) -> bool:
         """Write a temporary file, call the guard, and give the file its name by `step`;
         see `markers`.
@@ -246,14 +247,13 @@ class Folder:
         final: Path,
         data: bytes,
         step: Callable[[Path, Path], None],
-        guard: Guard | None,
+        guard: Guard,
     ) -> bool:
         """False if a withdrawal has removed the temporary file."""
         temporary = self._temporary(data, for_file=final)
         try:
             self._make(final.parent)
-            if guard is not None:
-                guard()
+            guard()
             step(temporary, final)
         except FileNotFoundError:
             if temporary.exists() and final.parent.is_dir():

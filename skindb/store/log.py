@@ -16,7 +16,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 
-from skindb.errors import Fault, InputError, input_error
+from skindb.errors import Fault, InputError, attempt, input_error
 from skindb.files import Json
 from skindb.store.markers import WithdrawnError
 from skindb.store.place import (
@@ -26,11 +26,11 @@ from skindb.store.place import (
     Guard,
     Place,
     require_text,
+    unguarded,
 )
 from skindb.store.record import (
     FORMAT,
     Record,
-    collect_faults,
     damage_as_fault,
     intact_or_none,
     json_object,
@@ -95,7 +95,7 @@ class Log:
             self.head(), self.generations()
         )
 
-    def create(self, record: Record, guard: Guard | None = None) -> Record:
+    def create(self, record: Record, guard: Guard = unguarded) -> Record:
         """Commit `record` as the current one and return it sealed.
 
         Parameters
@@ -157,7 +157,7 @@ class Log:
         preceding = 0
         seal = ""
         for generation in listed:
-            record = collect_faults(partial(self._read, generation), faults)
+            record = attempt(faults, partial(self._read, generation))
             if record is None:
                 seal = "?"
             else:
@@ -247,9 +247,7 @@ class Log:
         cure = f"{RESTORE}; if the log is correct, remove {self.head_key}"
         return [Fault(self.what, rule, finding, cure)]
 
-    def _write_head(
-        self, generation: int, seal: str, guard: Guard | None = None
-    ) -> None:
+    def _write_head(self, generation: int, seal: str, guard: Guard = unguarded) -> None:
         try:
             self.place.replace(
                 self.head_key, self.head_content(generation, seal), guard=guard

@@ -47,6 +47,8 @@ from skindb.errors import (
     Fault,
     InputError,
     SkindbWarning,
+    UnavailableError,
+    attempt,
     input_error,
     system_fault,
 )
@@ -54,10 +56,9 @@ from skindb.files import Attributes, Json, make_private, private_file, read_regu
 from skindb.limits import MAX_STORE_JSON_BYTES
 from skindb.schema.consent import consent_scope
 from skindb.store.folder import flush_path
-from skindb.store.place import AUDIT, Place, UnavailableError
+from skindb.store.place import AUDIT, Place
 from skindb.store.record import (
     Record,
-    collect_faults,
     damage_as_fault,
     json_object,
     seal_of,
@@ -187,11 +188,11 @@ def marker_faults(place: Place) -> list[Fault]:
     if not hashes and not place.file_type(SECRET):
         return []
     faults: list[Fault] = []
-    secret = collect_faults(partial(require_secret, place), faults)
+    secret = attempt(faults, partial(require_secret, place))
     if secret is not None:
         for name in sorted(hashes):
             key = f"{WITHDRAWN}/{name}.json"
-            collect_faults(partial(_read_entry, place, secret, key), faults)
+            attempt(faults, partial(_read_entry, place, secret, key))
     return faults
 
 

@@ -1,5 +1,12 @@
-"""What a location of a database is, a local folder or a bucket: the keys of its files, which
-never lead outside it, and the protocol by which they are read and written.
+"""What a location of a database is, a local folder or a bucket, both of which store bytes
+under keys: relative paths with "/" as the separator, which never lead outside.
+
+A key that does raises an `InputError`, a missing file a `FileNotFoundError`, and a file
+that cannot be read an `OSError`; both have a readable `strerror`.
+
+The guard of a file to be written is called in the last step before the file exists. In a
+bucket it is called again afterwards: if it raises then, a replaced file is removed, and
+the caller must remove a created one.
 """
 
 from __future__ import annotations
@@ -7,17 +14,22 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple, Protocol, TypeVar
-
-from zarr.abc.store import Store
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias, TypeVar
 
 from skindb.errors import Fault, InputError, input_error
 
+if TYPE_CHECKING:
+    from skindb.store.bucket import Bucket
+    from skindb.store.folder import Folder
+
 T = TypeVar("T")
 R = TypeVar("R")
+# two with the same name are the same; if it is unlocked, this process may work on a backup,
+# or on a database that is being restored, see `markers.LOCKS`
+Place: TypeAlias = "Bucket | Folder"
 STUDY = "population"  # results of a study of many takes
 RELEASE = "release"  # one version of every take under a name
 CALIBRATION = "calibration"  # of the lights of a dome
@@ -48,6 +60,10 @@ class Digests(NamedTuple):
 
     whole: str
     blocks: tuple[str, ...] = ()
+
+
+def unguarded() -> None:
+    """The guard of files that may always be written."""
 
 
 def digests_of(parts: Iterable[bytes]) -> Digests:
@@ -146,115 +162,9 @@ def _outside_fault(root: Path | str, key: str, finding: str) -> Fault:
     )
 
 
-class UnavailableError(InputError):
-    """The place does not answer or refuses access, so that its contents are unknown but
-    not known to be damaged.
-    """
-
-
 class Located(Protocol):
     """Something with a location, such as a database."""
 
     @property
     def place(self) -> Place:
         """Its location."""
-
-
-class Place(Protocol):
-    """A place that stores bytes under keys, which are relative paths with "/" as the separator.
-
-    A key that leads outside the place raises an `InputError`, a missing file a
-    `FileNotFoundError`, and a file that cannot be read an `OSError`; both have a
-    readable `strerror`.
-    """
-
-    is_unlocked: bool
-    """Whether this process may work on a backup, or on a database that is being
-    restored; see `markers.LOCKS`.
-    """
-
-    @property
-    def name(self) -> str:
-        """Name of the place in messages; two places with the same name are the same."""
-
-    def writable(self, key: str) -> Store:
-        """A writable zarr store at a key; versions are read through `VerifiedStore`."""
-
-    def scratch(self) -> Path:
-        """Path of a local folder for temporary files, which may not exist yet."""
-
-    def marker_file(self) -> Path:
-        """Path of the local file outside the place that notes withdrawals and consents;
-        see `marker_file`.
-        """
-
-    def address(self) -> str:
-        """URL by which another process finds the place."""
-
-    def url(self, key: str) -> str:
-        """Address of a key as shown to users."""
-
-    def where(self, key: str) -> str:
-        """Name of a key in messages; the key may contain any characters."""
-
-    def names(self) -> list[str] | None:
-        """Names at the top level; None if the place does not exist."""
-
-    def children(self, key: str, *, links: bool = False) -> list[str]:
-        """Names directly below a key, sorted; symbolic links are excluded unless `links` is set."""
-
-    def file_type(self, key: str) -> str:
-        """Type of a key: "folder", "file", "link" or "other"; empty if it does not exist."""
-
-    def sizes(self, key: str) -> dict[str, int]:
-        """Size in bytes of every file below a key, by its path relative to the key; -1
-        if it is not a regular file.
-        """
-
-    def read(self, key: str, begin: int = 0, end: int | None = None) -> bytes:
-        """Contents of a file from byte `begin`, counted from its end if negative, up to `end`."""
-
-    def read_small(self, key: str) -> bytes:
-        """Contents of a JSON file, whose size is limited."""
-
-    def digests(self, key: str) -> Digests:
-        """Digests of a file."""
-
-    def identities(self, key: str) -> dict[str, tuple[Hashable, ...]]:
-        """The identity of every file below a key, which changes whenever the file is
-        written or replaced, by its path relative to the key; (-1,) if not a regular file.
-        """
-
-    def modified(self, key: str) -> float:
-        """Time in seconds, by the clock of the storage, when a file or the newest file
-        below a key was written.
-        """
-
-    def now(self) -> float:
-        """Time of the clock of the storage, which is the same for all machines that share it."""
-
-    def make_durable(self, key: str) -> None:
-        """Return when everything below a key survives a power loss."""
-
-    def create(self, key: str, data: bytes, *, guard: Guard | None = None) -> bool:
-        """Write a file durably if it does not exist yet; returns False and writes
-        nothing if it exists.
-
-        The guard is called in the last step before the file exists. In a bucket it is
-        called again afterwards, and if it raises then, the caller must remove the file.
-        """
-
-    def replace(self, key: str, data: bytes, *, guard: Guard | None = None) -> None:
-        """Write or replace a small file atomically; never for versions and their records.
-
-        The guard is called as by `create`. If it raises after the file was written, the
-        file is removed.
-        """
-
-    def sweep(self) -> None:
-        """Make the writers whose guards were called already, but whose files do not
-        exist yet, call them again.
-        """
-
-    def remove(self, key: str) -> None:
-        """Delete a file, or everything below a key; missing files are ignored."""

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import Any, TypeVar
 
-from skindb.errors import Fault, InputError, input_error
+from skindb.errors import InputError, UnavailableError, input_error
 from skindb.files import Attributes, Json, json_depth
 from skindb.limits import MAX_JSON_DEPTH
 from skindb.schema import SCHEMA_VERSION, VARIABLES
@@ -22,7 +22,6 @@ from skindb.store.place import (
     KINDS_WITHOUT_SUBJECT,
     TAKE,
     VERSION,
-    UnavailableError,
     subject_of,
 )
 
@@ -95,17 +94,6 @@ def intact_or_none(read: Callable[[], T]) -> T | None:
     except UnavailableError:
         raise
     except DAMAGE:
-        return None
-
-
-def collect_faults(read: Callable[[], T], faults: list[Fault]) -> T | None:
-    """What a function reads; None if it fails, and its faults are added to `faults`."""
-    try:
-        return read()
-    except UnavailableError:
-        raise
-    except InputError as error:
-        faults.extend(error.faults)
         return None
 
 

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from skindb.errors import Fault, input_error
-from skindb.store.place import UnavailableError
+from skindb.errors import Fault, UnavailableError, input_error
 
 if TYPE_CHECKING:
     from obstore.store import BackoffConfig, S3Store

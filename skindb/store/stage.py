@@ -18,7 +18,7 @@ from xarray import DataArray, Dataset, Variable
 from zarr.codecs import BloscCodec
 
 from skindb import __version__
-from skindb.errors import Fault, InputError, add_filename, input_error
+from skindb.errors import Fault, InputError, UnavailableError, add_filename, input_error
 from skindb.files import Attributes, Json, plain
 from skindb.schema import SCHEMA_VERSION, VARIABLES, check, dataset
 from skindb.schema.label import BLOCK_SURFELS
@@ -36,7 +36,6 @@ from skindb.store.place import (
     KINDS_OF_ONE_SUBJECT,
     TAKE,
     Place,
-    UnavailableError,
     in_parallel,
     require_text,
 )

@@ -18,7 +18,7 @@ from functools import cache as cached
 from functools import partial
 from typing import Any, Literal
 
-from skindb.errors import Fault, InputError, SkindbWarning
+from skindb.errors import Fault, InputError, SkindbWarning, UnavailableError, attempt
 from skindb.schema.consent import CONSENT
 from skindb.store.entries import CACHED_KINDS
 from skindb.store.log import Log
@@ -30,13 +30,11 @@ from skindb.store.place import (
     TAKE,
     Located,
     Place,
-    UnavailableError,
     subject_of,
 )
 from skindb.store.record import (
     Key,
     Record,
-    collect_faults,
     damage_as_fault,
     intact_or_none,
     sealed,
@@ -306,7 +304,7 @@ def read_requests(place: Place) -> tuple[list[Request], list[Fault]]:
         if not re.fullmatch(REQUEST_NAME, name):
             continue
         key = f"{REQUESTS}/{name}"
-        request = collect_faults(partial(_read_request, place, key), faults)
+        request = attempt(faults, partial(_read_request, place, key))
         requests += [] if request is None else [request]
     return requests, faults
 

@@ -7,7 +7,7 @@ from functools import partial
 
 from xarray import open_datatree
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, UnavailableError
 from skindb.store.audit import BLOCK_NAME, ENTRY_NAME, read_audit
 from skindb.store.entries import CATALOGUE, CATALOGUE_BLOCK
 from skindb.store.erasure import holdings_of
@@ -24,7 +24,6 @@ from skindb.store.place import (
     TAKE,
     TIME_HEX,
     Place,
-    UnavailableError,
     in_parallel,
 )
 from skindb.store.record import AS_RECORDED, Record, json_object

@@ -23,7 +23,7 @@ from stored import commit, groups
 from waiting import PATIENCE_SECONDS
 
 import skindb
-from skindb.errors import InputError
+from skindb.errors import InputError, UnavailableError
 from skindb.schema import dataset
 from skindb.schema.label import BLOCK_SURFELS
 from skindb.store import Conflict, Database, s3
@@ -33,7 +33,6 @@ from skindb.store.bucket import Bucket
 from skindb.store.folder import Folder
 from skindb.store.lease import LEASE_SECONDS
 from skindb.store.log import Log
-from skindb.store.place import UnavailableError
 from skindb.store.verified import CHANGED
 
 WRITERS = 8

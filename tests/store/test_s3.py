@@ -11,9 +11,8 @@ from bucket_server import KEY, SECRET
 from faulty_proxy import faulty_proxy
 from stored import commit
 
-from skindb.errors import InputError
+from skindb.errors import InputError, UnavailableError
 from skindb.store import Database, s3
-from skindb.store.place import UnavailableError
 
 
 @pytest.fixture(autouse=True)
