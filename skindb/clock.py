@@ -18,24 +18,8 @@ class Clock(Protocol):
     def sleep(self, seconds: float) -> None:
         """Wait."""
 
-    def now(self) -> float:
+    def time(self) -> float:
         """Seconds since 1970."""
-
-
-class SystemClock:
-    """The clock of this computer."""
-
-    def monotonic(self) -> float:
-        """Seconds since an arbitrary moment."""
-        return time.monotonic()
-
-    def sleep(self, seconds: float) -> None:
-        """Wait."""
-        time.sleep(seconds)
-
-    def now(self) -> float:
-        """Seconds since 1970."""
-        return time.time()
 
 
 class SimulatedClock:
@@ -68,9 +52,9 @@ class SimulatedClock:
             for act in self._actors:
                 act()
 
-    def now(self) -> float:
+    def time(self) -> float:
         """Simulated seconds since 1970."""
         return self._start + self._seconds
 
 
-SYSTEM_CLOCK = SystemClock()
+SYSTEM_CLOCK: Clock = time  # that of this computer

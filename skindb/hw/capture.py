@@ -187,7 +187,7 @@ def _run_lights(
             remaining,
             marker_light=light,
             override=override,
-            begin=lambda part: session.begin_run(part, clock.now()),
+            begin=lambda part: session.begin_run(part, clock.time()),
             progress=progress,
         )
     except InputError:  # nothing was lit

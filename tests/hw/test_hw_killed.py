@@ -24,7 +24,7 @@ from devices_pair import (
 from served_devices import Server
 from waiting import wait_until
 
-from skindb.clock import SystemClock
+from skindb.clock import SYSTEM_CLOCK
 from skindb.hw.cameras import FolderCameras
 from skindb.hw.capture import CapturePlan, Devices, run_capture
 from skindb.hw.capture_folder import Subject, read_setup
@@ -79,7 +79,7 @@ def setup(tmp_path):
 @contextmanager
 def _served_laboratory(setup, watched):
     """A laboratory in real time, whose controller is at a socket."""
-    laboratory = Laboratory(setup, watched, clock=SystemClock())
+    laboratory = Laboratory(setup, watched, clock=SYSTEM_CLOCK)
     with Server(laboratory.dome) as server:
         yield laboratory, server.url
 

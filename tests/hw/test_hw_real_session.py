@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from served_devices import Server
 
 from skindb.cli import cli
-from skindb.clock import SystemClock
+from skindb.clock import SYSTEM_CLOCK
 from skindb.ingest import read_capture
 from skindb.virtual.laboratory import Laboratory
 
@@ -43,7 +43,7 @@ def setup(tmp_path_factory):
 
 def _capture(setup, out, *options):
     """A session with a laboratory in real time."""
-    laboratory = Laboratory(setup, out.parent / "frames", clock=SystemClock())
+    laboratory = Laboratory(setup, out.parent / "frames", clock=SYSTEM_CLOCK)
     with Server(laboratory.dome) as dome:
         own = [
             "--setup",
