@@ -33,7 +33,7 @@ from skindb.fit import (
     fit_surface,
     reduce_basis,
 )
-from skindb.fit.lumitexels import block_of, disc_angle, lumitexels, take_noise
+from skindb.fit.lumitexels import block_of, disc_angle, lumitexels
 from skindb.fit.surface import NEEDED, noise_floor, refit_and_evaluate
 from skindb.reflectance._lumitexel_kernels import MIN_SAMPLES_GLOSS
 from skindb.reflectance.dictionary import disc_dictionary
@@ -145,7 +145,7 @@ def _second_pass(fitted: xr.Dataset, basis: xr.Dataset) -> Callable[[], Any]:
 def _linear_refit(fitted: xr.Dataset, basis: xr.Dataset) -> Callable[[], Any]:
     """Weights and residuals without their errors."""
     arrays = {name: fitted[name].values for name in NEEDED}
-    block = block_of(arrays, take_noise(fitted))
+    block = block_of(arrays)
     comparison = Comparison("linear", 1.3, noise_floor(fitted), MIN_SAMPLES_GLOSS)
     surface = surface_model(basis)
     return lambda: surface.fit(block, comparison, Judgement())

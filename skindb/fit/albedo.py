@@ -21,7 +21,6 @@ from skindb.parameters import BARE_SKIN
 from skindb.reflectance._separation_kernels import (
     MAX_GLOSS_CROSSED,
 )
-from skindb.reflectance.model import typical_noise
 from skindb.reflectance.separation import separate_diffuse
 from skindb.schema import check
 from skindb.schema.declaration import LARGEST_R_D, SMALLEST_R_D
@@ -127,7 +126,7 @@ def block_reflectance(
     turns = [_turn(arrays.get(name), n) for name in NORMAL_ERRORS]
     if "normal_total_error" not in arrays:
         turns[1] = turns[0]
-    block = block_of(arrays, typical_noise())
+    block = block_of(arrays)
     value, error, shared, gloss = separate_diffuse(
         block, np.stack(turns, axis=1), eta=eta
     )

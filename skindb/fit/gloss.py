@@ -19,7 +19,6 @@ from skindb.fit.lumitexels import (
     directions,
     noise_inputs,
     scan_error,
-    take_noise,
 )
 from skindb.fit.surface import noise_floor
 from skindb.geometry.interreflection import tangent_frames
@@ -209,7 +208,7 @@ def _refined(part: xr.Dataset, prior: Gloss, eta: float, scan_error: float) -> J
     """The joint fit of surfels with estimates."""
     arrays = {str(name): part[name].values for name in part.data_vars}
     return refine_block(
-        block_of(arrays, take_noise(part)),
+        block_of(arrays),
         Comparison("perceptual", eta, noise_floor(part), min_width=MIN_LOBE_WIDTH),
         scan_normal=arrays["surfel_normal"],
         scan_error=float(np.deg2rad(scan_error) / np.sqrt(2)),

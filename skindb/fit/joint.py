@@ -14,7 +14,6 @@ from skindb.fit.lumitexels import (
     block_of,
     by_name,
     noise_inputs,
-    take_noise,
 )
 from skindb.fit.surface import noise_floor
 from skindb.optics.diffusion import dipole_s
@@ -94,7 +93,6 @@ def refine_jointly(
     comparison = Comparison(
         "perceptual", eta, noise_floor(lumitexels), min_width=MIN_LOBE_WIDTH
     )
-    noise = take_noise(lumitexels)
     names = tuple(
         dict.fromkeys((*GEOMETRY, "surfel_normal", *noise_inputs(lumitexels), *REFINED))
     )
@@ -102,7 +100,7 @@ def refine_jointly(
     def kernel(arrays: Arrays) -> tuple[Array, ...]:
         lobes = shared_lobes(arrays, gloss)
         refined = refine_block(
-            block_of(arrays, noise),
+            block_of(arrays),
             comparison,
             scan_normal=arrays["surfel_normal"],
             scan_error=float(np.deg2rad(scan_error) / np.sqrt(2)),

@@ -12,7 +12,7 @@ import xarray as xr
 
 from skindb.errors import Fault, InputError
 from skindb.parameters import SCAN_ERROR_DEGREES
-from skindb.reflectance.model import Block, Noise, typical_noise
+from skindb.reflectance.model import UNKNOWN_NOISE, Block, Noise
 from skindb.schema import check, variables
 from skindb.types import AnyArray, Array
 
@@ -125,7 +125,7 @@ def by_name(
     return call
 
 
-def block_of(arrays: Arrays, typical: Noise) -> Block:
+def block_of(arrays: Arrays) -> Block:
     """The block of surfels in these variables, and in those of `noise_inputs`; R_d is NaN
     where it is not among them.
     """
@@ -137,7 +137,7 @@ def block_of(arrays: Arrays, typical: Noise) -> Block:
         camera=arrays["camera_position"],
         normal=normal,
         diffuse=arrays.get("diffuse_reflectance", np.full_like(normal, np.nan)),
-        noise=noise_of(arrays, typical),
+        noise=noise_of(arrays),
         polarisation=_polarisation(arrays),
     )
 
@@ -162,24 +162,19 @@ def noise_inputs(lumitexels: xr.Dataset) -> tuple[str, ...]:
     )
 
 
-def take_noise(lumitexels: xr.Dataset) -> Noise:
-    """Noise of captures without the noise of each sample, whose photon noise is unknown."""
-    return typical_noise(float(lumitexels["noise_floor"]))
-
-
-def noise_of(arrays: Arrays, typical: Noise) -> Noise:
+def noise_of(arrays: Arrays) -> Noise:
     """Noise of the samples of a block of surfels from the variables of `noise_inputs`,
-    or else the typical one.
+    if it has them.
     """
     if not all(name in arrays for name in NOISE_INPUTS):
-        return typical
+        return UNKNOWN_NOISE
     scale = _reflectance_per_radiance(
         arrays, arrays["light_intensity"].mean(axis=1, keepdims=True)
     )
     limit, read, slope = (
         np.ascontiguousarray(arrays[name].mean(axis=1), np.float32) for name in RADIANCE
     )
-    return typical._replace(
+    return Noise(
         per_radiance=np.ascontiguousarray(scale[..., 0], np.float32),
         pixels=np.ascontiguousarray(arrays["effective_pixels"], np.float32),
         limit=limit,

@@ -14,14 +14,7 @@ from dask.base import compute
 from dask.delayed import delayed
 
 from skindb.elementwise import elementwise
-from skindb.fit.lumitexels import (
-    GEOMETRY,
-    Arrays,
-    block_of,
-    by_name,
-    noise_inputs,
-    take_noise,
-)
+from skindb.fit.lumitexels import GEOMETRY, Arrays, block_of, by_name, noise_inputs
 from skindb.fit.quality import HELD_OUT_ERRORS, misfits
 from skindb.reflectance._lumitexel_kernels import MIN_SAMPLES_GLOSS
 from skindb.reflectance.kinds import surface_model
@@ -83,11 +76,10 @@ def fit_surface(
     comparison = Comparison(
         mode, eta, noise_floor(lumitexels), MIN_SAMPLES_GLOSS, min_width
     )
-    noise = take_noise(lumitexels)
     names = _unique(*NEEDED, *noise_inputs(lumitexels))
 
     def kernel(arrays: Arrays) -> tuple[Any, ...]:
-        columns = surface.fit_columns(surface.fit(block_of(arrays, noise), comparison))
+        columns = surface.fit_columns(surface.fit(block_of(arrays), comparison))
         return tuple(columns[name] for name in surface.fit_variables)
 
     fitted = elementwise(
@@ -299,7 +291,6 @@ def _judged(
     names = _unique(*NEEDED, *noise_inputs(lumitexels), *parameter_names, *errors)
     check(lumitexels, (*NEEDED, *parameter_names), where="lumitexels")
     comparison = Comparison(mode, eta, noise_floor(lumitexels), min_samples, min_width)
-    noise = take_noise(lumitexels)
 
     def judge(part: xr.Dataset) -> tuple[dict[str, Array], Index]:
         arrays = {name: part[name].values for name in names}
@@ -308,7 +299,7 @@ def _judged(
             diffuse_error = np.zeros((part.sizes["surfel"], 3))
         judgement = Judgement(diffuse_error, arrays.get("normal_error"), held, outliers)
         parameters = surface.parameters_of(part) if evaluate else None
-        judged = surface.fit(block_of(arrays, noise), comparison, judgement, parameters)
+        judged = surface.fit(block_of(arrays), comparison, judgement, parameters)
         fitted = {} if evaluate else surface.judged_columns(judged)
         return fitted | _error_columns(judged, judgement), judged.counts
 

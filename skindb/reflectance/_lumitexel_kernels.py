@@ -408,9 +408,8 @@ def write_noise(surfel: int, count: int, noise: Noise, b: Lumitexel) -> bool:
     depend on the values otherwise, as this would favour low values.
     """
     if noise.per_radiance.shape[0] == 0:
-        b.noise[:, :count] = noise.floor * noise.floor if noise.shot > 0.0 else 0.0
-        b.noise[1, :count] = noise.shot
-        return bool(noise.shot > 0.0)
+        b.noise[:, :count] = 0.0
+        return False
     last = noise.limit.shape[1] - 1
     for r in range(count):
         i = b.pairs[r, 0]

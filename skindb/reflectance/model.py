@@ -20,11 +20,7 @@ MAX_TABLES = 8  # that the viewer shows: two textures of four channels each
 
 
 class Noise(NamedTuple):
-    """Noise model of the samples of n surfels, mean over the channels.
-
-    For captures without the noise of each sample the arrays are (0, ...); the variance
-    is then floor^2 + shot sample, or unknown if shot is 0.
-    """
+    """Noise model of the samples of n surfels, mean over the channels; see UNKNOWN_NOISE."""
 
     per_radiance: Float32  # (n, lights) reflectance of radiance 1
     pixels: Float32  # (n, cameras) effective number of pixels
@@ -32,14 +28,9 @@ class Noise(NamedTuple):
     limit: Float32
     read: Float32  # (cameras, exposures) variance of radiance 0
     slope: Float32  # (cameras, exposures) variance over radiance
-    floor: float  # sr^-1
-    shot: float  # sr^-1
 
 
-def typical_noise(floor: float = 0.0, shot: float = 0.0) -> Noise:
-    """Noise of all samples, variance = floor^2 + shot sample [sr^-2]; unknown if shot is 0."""
-    empty = np.zeros((0, 0), np.float32)
-    return Noise(empty, empty, empty, empty, empty, floor, shot)
+UNKNOWN_NOISE = Noise(*[np.zeros((0, 0), np.float32)] * 5)
 
 
 class Block(NamedTuple):
@@ -51,7 +42,7 @@ class Block(NamedTuple):
     camera: AnyArray  # (cameras, 3) mm
     normal: AnyArray  # (n, 3) unit shading normals
     diffuse: AnyArray  # (n, 3) R_d
-    noise: Noise = typical_noise()
+    noise: Noise = UNKNOWN_NOISE
     # (lights, cameras) product of their degrees of circular polarisation; (0, 0) without
     # polarisers
     polarisation: AnyArray = np.zeros((0, 0))

@@ -13,7 +13,7 @@ from skindb.reflectance._lumitexel_kernels import (
     weigh,
 )
 from skindb.reflectance.block import MODES
-from skindb.reflectance.model import typical_noise
+from skindb.reflectance.model import UNKNOWN_NOISE, Noise
 
 
 def test_directions__no_direction_is_nan():
@@ -32,7 +32,11 @@ def test_weigh__noise_over_the_error_of_models_in_plain_numpy(mode):
     memory.scattered[:, :count] = rng.uniform(0, 0.3, (3, count))
     weight = memory.weight
     options = Options(1.3, MODES.index(mode), floor, 1, True)
-    weigh(0, count, typical_noise(noise, shot), options, memory)
+    memory.pairs[:] = 0
+    sizes = (1, 10), (1, 6), (6, 1), (6, 1), (6, 1)
+    values = 1.0, 1.0, np.inf, noise**2, shot
+    known = Noise(*map(np.full, sizes, values, [np.float32] * len(sizes)))
+    weigh(0, count, known, options, memory)
 
     level = memory.scattered[:, :count].mean(axis=0, dtype=np.float64)
     mean = level.mean()
@@ -50,5 +54,5 @@ def test_weigh__noise_over_the_error_of_models_in_plain_numpy(mode):
     np.testing.assert_allclose(weight[:count], 1 / (1 + (spread / own) ** 2), rtol=1e-4)
     assert weight[:count].max() > 1.1 * weight[:count].min()
 
-    weigh(0, count, typical_noise(), options, memory)
+    weigh(0, count, UNKNOWN_NOISE, options, memory)
     assert (weight[:count] == 1).all()

@@ -17,9 +17,9 @@ from skindb.reflectance.joint import refine_block
 from skindb.reflectance.lobes import GRADED_ROUGHNESS
 from skindb.reflectance.model import (
     MIN_LOBE_WIDTH,
+    UNKNOWN_NOISE,
     Block,
     Comparison,
-    typical_noise,
 )
 
 COMPARISON = Comparison("perceptual", ETA, 2e-3, 10, MIN_LOBE_WIDTH)
@@ -91,7 +91,7 @@ def _refined(sample, normal, dome, diffuse=R_D, noise=None, scan_error=1.0):
         camera,
         normal,
         np.tile(diffuse, (n, 1)),
-        noise or typical_noise(),
+        noise or UNKNOWN_NOISE,
     )
     scan = np.tile([0.0, 0.0, 1.0], (n, 1))
     return refine_block(block, COMPARISON, scan_normal=scan, scan_error=scan_error)

@@ -26,7 +26,6 @@ from skindb.reflectance._lumitexel_kernels import (
     write_rows,
 )
 from skindb.reflectance.block import MODES
-from skindb.reflectance.model import typical_noise
 from skindb.reflectance.tables import pad_to_lanes
 from skindb.schema import label
 
@@ -96,7 +95,7 @@ def test_write_noise__variance_of_each_sample_by_hand(skin, whole):
     known = with_noise(skin.lumitexels, whole=whole)
     arrays = {name: known[name].values for name in NOISE_INPUTS}
     sample = known["reflectance_sample"].values
-    noise = noise_of(arrays, typical_noise())
+    noise = noise_of(arrays)
     table = np.zeros((3, 3, 3, 4), np.float32)
     b = lumitexel_memory(20, 4, 8)
     rows = 0
@@ -158,7 +157,6 @@ def test_weigh__no_weight_exceeds_what_noise_permits(skin, mode):
         noise = noise_of(
             arrays
             | {"effective_pixels": np.full_like(arrays["effective_pixels"], pixels)},
-            typical_noise(),
         )
         b = lumitexel_memory(20, 4, 8)
         weight = b.weight
