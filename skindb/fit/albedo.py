@@ -147,4 +147,4 @@ def _turn(normal_error: Array | None, surfels: int) -> Float64:
         return np.zeros(surfels)
     radians = np.nan_to_num(np.deg2rad(normal_error, dtype=float))
     # the RMS angle is that of two axes
-    return np.asarray(np.clip(radians, 0, LARGEST_TURN) / np.sqrt(2))
+    return np.clip(radians, 0, LARGEST_TURN) / np.sqrt(2)

@@ -297,7 +297,7 @@ def _rms(values: Array) -> Array:
     square = np.square(np.where(finite, values, 0), dtype=np.float64).sum(
         axis=(1, 2, 3)
     )
-    return np.asarray(np.sqrt(square / np.maximum(finite.sum(axis=(1, 2, 3)), 1)))
+    return np.sqrt(square / np.maximum(finite.sum(axis=(1, 2, 3)), 1))
 
 
 def _drawn(count: int, rng: np.random.Generator) -> Mask:

@@ -443,7 +443,7 @@ def _shading(direction: Array, eta: float) -> Array:
     of the surfel.
     """
     enters = fresnel_transmittance(np.clip(direction[:, 2], MIN_COSINE_GAIN, 1.0), eta)
-    return np.asarray(direction * enters[:, None])
+    return direction * enters[:, None]
 
 
 def bounced_light(
@@ -524,7 +524,7 @@ def bounced_light(
 
 def _square_distance(points: Array, light: Array) -> Array:
     """(n, l) squared distances in mm^2."""
-    return np.asarray(np.square(points[:, None] - light).sum(axis=2))
+    return np.square(points[:, None] - light).sum(axis=2)
 
 
 def without_bounce(

@@ -157,7 +157,7 @@ def _mean_lobes(lumitexels: xr.Dataset, eta: float) -> Array:
     fitted = np.isfinite(refined.normal_error)
     if fitted.sum() < MIN_SURFELS:
         return unknown
-    return np.asarray(refined.strength[fitted].mean(axis=0))
+    return refined.strength[fitted].mean(axis=0)
 
 
 def common_lobes(takes: Sequence[xr.Dataset]) -> xr.Dataset:
@@ -191,7 +191,7 @@ def _samples(lumitexels: xr.Dataset, surfels: int) -> xr.Dataset:
 def _sample_count(part: xr.Dataset) -> Array:
     """Number of samples (surfel,)."""
     finite = np.isfinite(part["reflectance_sample"].values).all(axis=3)
-    return np.asarray(finite.sum(axis=(1, 2)))
+    return finite.sum(axis=(1, 2))
 
 
 def _spread(size: int, count: int) -> Array:
@@ -259,4 +259,4 @@ def _errors(
     predicted = np.where(steep, wi[..., 2] * value, np.nan)
     measured = part["reflectance_sample"].values.mean(axis=3)
     sum_of_both = np.maximum(predicted + np.abs(measured), 1e-9)
-    return np.asarray(np.abs(predicted - measured) / sum_of_both)
+    return np.abs(predicted - measured) / sum_of_both

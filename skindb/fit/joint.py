@@ -171,4 +171,4 @@ def _total_angle(refined: JointFit, sequential: Array) -> Array:
     noise = np.degrees(refined.normal_error)
     factor = np.minimum(TOTAL_NOISE, np.sqrt(refined.samples))
     square = TOTAL_SHARED**2 * (shared**2 + change**2) + (factor * noise) ** 2
-    return np.asarray(np.sqrt(square + TOTAL_ANGLE**2))
+    return np.sqrt(square + TOTAL_ANGLE**2)

@@ -246,7 +246,7 @@ def _reflectance_per_radiance(arrays: Arrays, intensity: Array) -> Array:
     if falloff.any():
         cosine = np.einsum("nlk,lk->nl", way, arrays["light_axis"]) / np.sqrt(square)
         square = square / np.maximum(cosine, 1e-3) ** falloff
-    return np.asarray(square[..., None] / intensity)
+    return square[..., None] / intensity
 
 
 def directions(points: Array, targets: Array) -> Array:
@@ -255,9 +255,9 @@ def directions(points: Array, targets: Array) -> Array:
     """
     way = targets.astype(np.float64)[None] - points.astype(np.float64)[:, None]
     length = np.linalg.norm(way, axis=-1, keepdims=True)
-    return np.asarray(way / np.where(length > 0, length, np.nan))
+    return way / np.where(length > 0, length, np.nan)
 
 
 def cosines(normal: Array, towards: Array) -> Array:
     """(n, t) cosines between normals (n, 3) and directions (n, t, 3)."""
-    return np.asarray(np.einsum("nk,ntk->nt", normal, towards))
+    return np.einsum("nk,ntk->nt", normal, towards)

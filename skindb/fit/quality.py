@@ -316,9 +316,7 @@ def _around(outliers: xr.Dataset, position: AnyArray) -> AnyArray:
     distance[np.arange(len(misfit)), np.arange(len(misfit))] = np.inf
     distance[:, ~np.isfinite(misfit)] = np.inf
     near = np.argsort(distance, axis=1)[:, :NEIGHBOURS]
-    return np.asarray(
-        np.fmax(np.median(misfit[near], axis=1), _usual(outliers["light_misfit"]))
-    )
+    return np.fmax(np.median(misfit[near], axis=1), _usual(outliers["light_misfit"]))
 
 
 def _beyond(counts: AnyArray) -> AnyArray:
@@ -386,7 +384,7 @@ def find_obstructed(fitted: xr.Dataset) -> Mask:
     brightness = fitted["diffuse_reflectance"].values.mean(axis=1)
     limit = max(TIMES_MEDIAN_RESIDUAL * float(np.median(residual[good])), MIN_RESIDUAL)
     dark = brightness < MAX_RELATIVE_R_D * float(np.median(brightness[good]))
-    return np.asarray(good & (residual > limit) & dark)
+    return good & (residual > limit) & dark
 
 
 # Chosen on a capture with hair, motion and errors of calibration: of the surfels within
@@ -420,7 +418,7 @@ def error_of_misfit(fitted: xr.Dataset) -> Float64:
     residual = _dictionary_residual(fitted)
     explained = TIMES_EXPLAINED_RESIDUAL * float(np.median(residual[good]))
     unexplained = np.sqrt(np.maximum(residual**2 - explained**2, 0.0))
-    return np.asarray(ERROR_PER_RESIDUAL * unexplained[:, None] * colour)
+    return ERROR_PER_RESIDUAL * unexplained[:, None] * colour
 
 
 def _dictionary_residual(fitted: xr.Dataset) -> Float64:

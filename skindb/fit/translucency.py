@@ -104,21 +104,19 @@ class Problem:
         a, s = (x[..., None, None] for x in _coefficients(p))
         profile = transport_profile(self.distance, a, s, eta=self.eta)
         value = (profile * self.face).sum(-1)
-        return np.asarray(
-            np.log(np.maximum(value, 1e-300)) + (p[..., 2:] if self.free_gain else 0.0)
+        return np.log(np.maximum(value, 1e-300)) + (
+            p[..., 2:] if self.free_gain else 0.0
         )
 
     def misfit(self, p: Array, weight: Array | float = 1.0) -> Array:
         """Weighted differences of measured and predicted logarithms."""
-        return np.asarray((self.log_profile - self.predict(p)) * weight)
+        return (self.log_profile - self.predict(p)) * weight
 
     def prior(self, p: Array) -> Array:
         """Deviation from the prior of sigma_s' in standard deviations, for fits with a
         free gain.
         """
-        return np.asarray(
-            (p[..., 1] - np.log(TYPICAL)) / TYPICAL_SPREAD * self.free_gain
-        )
+        return (p[..., 1] - np.log(TYPICAL)) / TYPICAL_SPREAD * self.free_gain
 
     def objective(self, p: Array, weight: Array) -> Array:
         """Weighted misfit, and with a free gain the prior of sigma_s'."""
@@ -129,7 +127,7 @@ class Problem:
         """-2 log likelihood (...) in which the error of the model counts as noise."""
         measured = self.error / np.exp(self.log_profile)
         spread = 2 * np.log(np.hypot(measured, self.discrepancy(p))).sum(-1)
-        return np.asarray(
+        return (
             (self.misfit(p, self.weight(p)) ** 2).sum(-1) + self.prior(p) ** 2 + spread
         )
 
@@ -137,20 +135,16 @@ class Problem:
         """Measured error of each logarithm, relative to the predicted value, as noise
         would bias it otherwise.
         """
-        return np.asarray(
-            self.error / np.exp(np.maximum(self.predict(p), self.log_profile - 1))
-        )
+        return self.error / np.exp(np.maximum(self.predict(p), self.log_profile - 1))
 
     def discrepancy(self, p: Array) -> Array:
         """Error of the model at each distance."""
         a, s = _coefficients(p)
-        return np.asarray(
-            NEAR_ERROR / (self.distance.mean(1) * (a + s)[..., None]) + FAR_ERROR
-        )
+        return NEAR_ERROR / (self.distance.mean(1) * (a + s)[..., None]) + FAR_ERROR
 
     def weight(self, p: Array) -> Array:
         """Inverse of both errors in quadrature."""
-        return np.asarray(1 / np.hypot(self.relative_error(p), self.discrepancy(p)))
+        return 1 / np.hypot(self.relative_error(p), self.discrepancy(p))
 
 
 def fit_profile(
@@ -236,7 +230,7 @@ def _valleys(problem: Problem) -> Array:
     depth = problem.deviance(p)
     edge = np.pad(depth, 1, constant_values=np.inf)
     low = np.flatnonzero((depth <= edge[:-2]) & (depth <= edge[2:]))
-    return np.asarray(p[low[np.argsort(depth[low])][:MOST]])
+    return p[low[np.argsort(depth[low])][:MOST]]
 
 
 def _faces(distance: Array, radius: float) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
-from skindb.errors import input_error
+from skindb.errors import require
 from skindb.geometry.mesh import (
     boundary_loops,
     edge_table,
@@ -148,13 +148,13 @@ def clean_mesh(
     report.add("slivers", points, repaired)
     report.add("slivers_left", points, remaining)
     current = _largest_component(points, current, report)
-    if not len(current):
-        raise input_error(
-            "mesh",
-            "a scan must have a surface",
-            "no non-degenerate face",
-            "export it again",
-        )
+    require(
+        len(current),
+        "mesh",
+        "a scan must have a surface",
+        "no non-degenerate face",
+        "export it again",
+    )
     current = _fill_small_holes(points, current, hole_edges, report)
     current, source = _split_bow_ties(current, len(points))
     report.add("bow_ties", points, source[len(points) :, None])

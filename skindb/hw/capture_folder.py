@@ -302,13 +302,13 @@ def require_space(folder: Path, setup: Setup, steps: int) -> None:
     pixels = sum(camera.width * camera.height for camera in setup.dome.cameras)
     needed = steps * pixels * 3 * 2  # bytes of three channels of 16 bits
     free = shutil.disk_usage(folder).free
-    if free < needed:
-        raise input_error(
-            str(folder),
-            f"{steps} steps of {len(setup.cameras)} cameras need up to {needed / 1e9:.1f} GB",
-            f"{free / 1e9:.1f} GB free",
-            "free some space, or choose another disk",
-        )
+    require(
+        free >= needed,
+        str(folder),
+        f"{steps} steps of {len(setup.cameras)} cameras need up to {needed / 1e9:.1f} GB",
+        f"{free / 1e9:.1f} GB free",
+        "free some space, or choose another disk",
+    )
 
 
 def remaining_schedule(

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from skindb.errors import Fault, input_error
+from skindb.errors import Fault, require
 from skindb.hw.link import (
     CLOCK_ERROR,
     EARLY_SECONDS,
@@ -186,13 +186,13 @@ class Probe:
         DeviceError
             If the probe stops answering, or if it or its gauge sends what cannot be right.
         """
-        if not -MAX_SUCTION_KPA <= pressure < 0:
-            raise input_error(
-                "probe",
-                f"the suction must be from {-MAX_SUCTION_KPA:g} to 0 kPa",
-                f"{pressure:g} kPa",
-                "use about -5 kPa",
-            )
+        require(
+            -MAX_SUCTION_KPA <= pressure < 0,
+            "probe",
+            f"the suction must be from {-MAX_SUCTION_KPA:g} to 0 kPa",
+            f"{pressure:g} kPa",
+            "use about -5 kPa",
+        )
         self.link.discard_events()
         with stopped_at_end(self.stop):
             gauge = Gauge(self.link, pressure)

@@ -82,7 +82,6 @@ from skindb.limits import MAX_RELIEF_POINTS
 from skindb.parameters import IngestParameters
 from skindb.types import Float64, Half, Progress, silent
 
-MIN_BACKGROUND = 0.01  # of the picture, from which it is noted
 MIN_THREADS = 2  # with two, one reads while the other computes
 MAX_THREADS = 8
 MAX_BYTES = 4 << 30  # of memory for all threads together, unless two threads need more
@@ -139,10 +138,11 @@ def ingest_capture(
         capture, spacing_mm=parameters.spacing_mm, planar=relief is not None
     )
     report("surfels", 1, 1)
-    run = _Run(capture, surfels, parameters, report, relief)
-    run.groups |= {"mesh": mesh_group(capture, surfels), "atlas": atlas_group(surfels)}
+    groups = {"mesh": mesh_group(capture, surfels), "atlas": atlas_group(surfels)}
+    begun = capture, surfels, parameters, report, relief, groups
     with ExitStack() as stack:
         if capture.dome is None:
+            run = _Run(*begun)
             run.groups["surfels"] = surfel_group(surfels, scan_error=capture.scan_error)
         else:
             dome = capture.dome
@@ -150,7 +150,8 @@ def ingest_capture(
             spool = stack.enter_context(Spool(Path(scratch), shape))
             # ends before the spool does
             pool = stack.enter_context(ThreadPoolExecutor(threads(dome)))
-            _DomeStages(run, dome, spool, pool).sample()
+            run = _DomeRun(*begun, dome=dome, spool=spool, pool=pool)
+            run.sample()
         # last, as the frames of the dome are checked only if nothing else is at fault
         run.measure_probe()
         run.require_no_faults()
@@ -193,8 +194,8 @@ class _Run:
     surfels: SurfelSet
     parameters: IngestParameters
     report: Progress
-    relief: Relief | None = None
-    groups: dict[str, xr.Dataset] = field(default_factory=dict)
+    relief: Relief | None
+    groups: dict[str, xr.Dataset]
     faults: list[Fault] = field(default_factory=list)
     digests: Digests = field(default_factory=Digests)
     summary: dict[str, Any] = field(default_factory=dict)
@@ -225,25 +226,18 @@ class _Run:
         """Provenance and summary of the version."""
         spacing = self.surfels.spacing()
         notes = [*self.notes]
-        if self.relief is None and self.parameters.spacing_mm > 1.5 * spacing:
+        wanted = self.parameters.spacing_mm
+        if self.relief is not None:
+            notes += self.relief.notes
+            if spacing > 1.5 * wanted:
+                notes.append(
+                    f"the surface that the photographs show has points {spacing:.2g} mm apart; "
+                    f"it is limited to the pixels, and to {MAX_RELIEF_POINTS:,} points"
+                )
+        elif wanted > 1.5 * spacing:
             notes.append(
                 f"the points of the scan are {spacing:.2g} mm apart; a wider spacing leaves "
                 "the scan unchanged"
-            )
-        if self.relief is not None and self.relief.background > MIN_BACKGROUND:
-            notes.append(
-                f"{self.relief.background:.0%} of the picture is a dark background with noise "
-                "and is excluded; a mask states the subject"
-            )
-        if self.relief is not None and self.relief.wrong_axes:
-            notes.append(
-                f"the lights seem to be {self.relief.wrong_axes}: check that x of their "
-                "directions is to the right, y up and z to the camera"
-            )
-        if self.relief is not None and spacing > 1.5 * self.parameters.spacing_mm:
-            notes.append(
-                f"the surface that the photographs show has points {spacing:.2g} mm apart; "
-                f"it is limited to the pixels, and to {MAX_RELIEF_POINTS:,} points"
             )
         count = len(self.surfels.position)
         summary = self.summary | {
@@ -279,36 +273,31 @@ def threads(dome: DomeRecord | None) -> int:
     return max(min(thread_count(), MAX_THREADS, MAX_BYTES // thread_bytes), MIN_THREADS)
 
 
-@dataclass
-class _DomeStages:
-    """The stages in which the frames of a dome are processed."""
+@dataclass(kw_only=True)
+class _DomeRun(_Run):
+    """An ingest with a dome."""
 
-    run: _Run
     dome: DomeRecord
     spool: Spool
     pool: Executor
 
     def sample(self) -> None:
-        """Add the groups surfels, samples, dome, photographs, calibration and sequence,
-        unless faults are found.
-        """
-        groups = self._groups()
+        """Add the groups of the dome, unless faults are found."""
+        groups = self._dome_groups()
         if groups and self.dome.sequence is not None:
             groups["sequence"] = sequence_group(self.dome.sequence, self.dome)
-        self.run.groups |= groups
-        self.run.digests |= {
-            Path(x): digest for x, digest in self.spool.digests.items()
-        }
+        self.groups |= groups
+        self.digests |= {Path(x): digest for x, digest in self.spool.digests.items()}
 
-    def _groups(self) -> dict[str, xr.Dataset]:
-        surfels = self.run.surfels
-        parameters = self.run.parameters
-        mergers = frame_mergers(self.dome, self.run.faults, self.run.digests)
+    def _dome_groups(self) -> dict[str, xr.Dataset]:
+        surfels = self.surfels
+        parameters = self.parameters
+        mergers = frame_mergers(self.dome, self.faults, self.digests)
         for merger in mergers.values():
-            self.run.faults += dark_faults(self.dome, merger)
+            self.faults += dark_faults(self.dome, merger)
         intensity, measured = self._intensity(mergers)
         scene = RayScene(surfels.position, surfels.faces)
-        relief = self.run.relief
+        relief = self.relief
         if relief is None:
             light_fraction = light_visibility(
                 surfels, self.dome.lights, scene, self.pool
@@ -323,7 +312,7 @@ class _DomeStages:
         if relief is not None:
             # every point was made from pixels that show it
             visible, clear = np.ones_like(visible), np.ones_like(clear)
-        self.run.report("visibility", 1, 1)
+        self.report("visibility", 1, 1)
         check = CalibrationCheck(
             self.dome, surfels, light_fraction, clear, pixels, intensity
         )
@@ -331,7 +320,7 @@ class _DomeStages:
         rotations = np.zeros((len(self.dome.cameras), 3))
         # a surface made from the photographs cannot contradict them
         checked = relief is None
-        if checked and parameters.refine is not False and not self.run.faults:
+        if checked and parameters.refine is not False and not self.faults:
             refined = self._refined(sampler)
             if refined is not self.dome:
                 rotations = applied_rotations(self.dome, refined)
@@ -342,21 +331,21 @@ class _DomeStages:
                 del scene
                 check = replace(check, dome=refined, clear=clear, pixels=pixels)
                 sampler = self._sampler(mergers, check)
-            self.run.report("refine", 1, 1)
+            self.report("refine", 1, 1)
         lumitexels = attempt(
-            self.run.faults,
+            self.faults,
             lambda: sampler.lumitexels(
-                check=checked and not self.run.faults,
+                check=checked and not self.faults,
                 refuse=parameters.calibration == "refuse",
             ),
         )
         if lumitexels is None:
             return {}
-        if measured and not self.run.faults:
+        if measured and not self.faults:
             levels = lumitexels.views
-            self.run.faults += sample_faults(self.dome, levels.median, levels.bright)
+            self.faults += sample_faults(self.dome, levels.median, levels.bright)
         if not lumitexels.view_count.any():
-            self.run.faults.append(
+            self.faults.append(
                 Fault(
                     "samples",
                     "a surfel must be lit by a light and seen by a camera",
@@ -364,7 +353,7 @@ class _DomeStages:
                     "check the crop, poses and positions",
                 )
             )
-        if self.run.faults:
+        if self.faults:
             return {}
         self._note(lumitexels, mergers, intensity)
         return self._labelled(lumitexels, check, visible, rotations)
@@ -377,9 +366,9 @@ class _DomeStages:
         again if the cameras are rotated.
         """
         check = sampler.check
-        choose = self.run.parameters.refine == "auto"
+        choose = self.parameters.refine == "auto"
         if choose and (reason := reason_to_skip(check)):
-            self._record(reason)
+            self.summary["corrections"] = {"refine": reason}
             return self.dome
         held_out = held_out_lights(check) if choose else frozenset[int]()
         pictures = sampler.pictures(pictures_to_judge(check, held_out))
@@ -388,18 +377,14 @@ class _DomeStages:
         if not choose:
             return refine_cameras(check, check.views(pictures))
         dome, reason = choose_refinement(check, pictures, held_out)
-        self._record(reason)
+        self.summary["corrections"] = {"refine": reason}
         return dome
-
-    def _record(self, reason: str) -> None:
-        """Record why the refinement was chosen or not."""
-        self.run.summary["corrections"] = {"refine": reason}
 
     def _sampler(
         self, mergers: Mapping[str, FrameMerger], check: CalibrationCheck
     ) -> Sampler:
-        surfels = self.run.surfels
-        parameters = self.run.parameters
+        surfels = self.surfels
+        parameters = self.parameters
         cameras = self.dome.cameras
         middle = surfels.position.mean(axis=0)
         return Sampler(
@@ -408,7 +393,7 @@ class _DomeStages:
             mergers,
             self.spool,
             self.pool,
-            self.run.report,
+            self.report,
             kept=choose_photographs(self.dome, middle, parameters.photographs),
         )
 
@@ -422,11 +407,11 @@ class _DomeStages:
         dome = self.dome
         groups = {
             "surfels": surfel_group(
-                self.run.surfels,
+                self.surfels,
                 dome,
                 check.light_visible,
                 visible,
-                scan_error=self.run.capture.scan_error,
+                scan_error=self.capture.scan_error,
             ),
             "samples": sample_group(dome, lumitexels),
             "dome": dome_group(dome, check.intensity),
@@ -448,18 +433,16 @@ class _DomeStages:
         dome = self.dome
         levels = lumitexels.views
         for merger in mergers.values():
-            self.run.notes += dark_notes(dome, merger)
-        self.run.notes += level_notes(dome, levels.highest, levels.clipped)
-        self.run.notes += light_notes(dome, intensity, levels.median)
+            self.notes += dark_notes(dome, merger)
+        self.notes += level_notes(dome, levels.highest, levels.clipped)
+        self.notes += light_notes(dome, intensity, levels.median)
         calibration = lumitexels.calibration
         if calibration is not None:
             # empty if refused
             faults = calibration_faults(dome, calibration)
-            self.run.notes += [str(fault) for fault in faults]
-            self.run.notes += calibration_notes(dome, calibration)
-        self.run.summary |= {
-            "samples": describe_samples(lumitexels, self.run.surfels, dome)
-        }
+            self.notes += [str(fault) for fault in faults]
+            self.notes += calibration_notes(dome, calibration)
+        self.summary |= {"samples": describe_samples(lumitexels, self.surfels, dome)}
 
     def _intensity(self, mergers: Mapping[str, FrameMerger]) -> tuple[Float64, bool]:
         """Intensities of the lights (light, 3), and whether they could be determined.
@@ -467,17 +450,17 @@ class _DomeStages:
         Otherwise they are 1, to find damaged frames of the face in the same run.
         """
         intensity = attempt(
-            self.run.faults,
+            self.faults,
             lambda: light_intensities(
                 self.dome,
                 mergers,
                 self.pool,
-                self.run.digests,
-                centre=self.run.surfels.position.mean(axis=0),
+                self.digests,
+                centre=self.surfels.position.mean(axis=0),
             ),
         )
-        self.run.report("lights", 1, 1)
+        self.report("lights", 1, 1)
         if intensity is None:
             return np.ones((len(self.dome.lights), 3)), False
-        self.run.faults += intensity_faults(self.dome, intensity)
+        self.faults += intensity_faults(self.dome, intensity)
         return intensity, True

@@ -120,9 +120,7 @@ class CalibrationCheck:
     def seen_area(self) -> Float64:
         """Area (light, camera) [mm2] that is lit and visible, projected to the camera."""
         area = [self._projected_area(camera) for camera in self.dome.cameras]
-        return np.asarray(
-            (self.irradiance > 0) @ (np.stack(area, axis=1) * self._clear)
-        )
+        return (self.irradiance > 0) @ (np.stack(area, axis=1) * self._clear)
 
     @cached_property
     def irradiance(self) -> Float64:
@@ -226,7 +224,7 @@ class CalibrationCheck:
 
     @cached_property
     def _middle(self) -> Float64:
-        return np.asarray(self.surfels.position.mean(axis=0))
+        return self.surfels.position.mean(axis=0)
 
     def cosine(self, camera: CameraRecord) -> Float64:
         """Cosine (n,) between the normals of the surfels and the direction to the camera."""
@@ -235,7 +233,7 @@ class CalibrationCheck:
     def _projected_area(self, camera: CameraRecord) -> Float64:
         """Area (n,) [mm2] of the surfels, projected towards the camera."""
         area = self.surfels.area[self.compared]
-        return np.asarray(np.maximum(self.cosine(camera), 0) * area)
+        return np.maximum(self.cosine(camera), 0) * area
 
     def factor(self, camera: int) -> int:
         """Downsampling factor of a camera."""

@@ -385,7 +385,7 @@ def _frontal(camera: CameraRecord, surfels: SurfelSet) -> Mask:
     """Where (n,) a view is steep enough for a pixel to cover little of the surface."""
     cosine = surfels.cosine(camera)
     width = camera.pixel_width(surfels.position.mean(axis=0))
-    return np.asarray(cosine >= max(MIN_COSINE_CAMERA, width / MAX_SMEAR_MM))
+    return cosine >= max(MIN_COSINE_CAMERA, width / MAX_SMEAR_MM)
 
 
 @dataclass(frozen=True)

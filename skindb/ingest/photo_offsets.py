@@ -108,7 +108,7 @@ def reduced(image: Float32, factor: int) -> Float32:
 
 def bilinear(image: Float64, pixels: Float64) -> Float64:
     """Interpolated values (n,) at pixels (n, 2); 0 outside the picture."""
-    return np.asarray(interpolated(image[..., None], pixels)[:, 0])
+    return interpolated(image[..., None], pixels)[:, 0]
 
 
 def interpolated(images: Float64, pixels: Float64) -> Float64:
@@ -201,7 +201,7 @@ def _large_shift(
     best = int(np.argmax(agreement))
     none = len(shifts) // 2
     better = agreement[best] > agreement[none] + 0.02
-    return np.asarray(shifts[best if better else none])
+    return shifts[best if better else none]
 
 
 def moved_pixels(view: ReducedView, offset: Offset) -> Float64:
@@ -241,7 +241,7 @@ def surfel_albedo(
 def square_root_image(image: Array) -> Float64:
     """Square roots of a picture, slightly smoothed so that its derivatives are smooth."""
     smooth = gaussian_filter(float64(image), SMOOTHING_PX)
-    return np.asarray(np.sqrt(np.maximum(smooth, 0)))
+    return np.sqrt(np.maximum(smooth, 0))
 
 
 def _gauss_newton(
@@ -308,9 +308,8 @@ def view_factors(
     grey = irradiance.mean(axis=1)
     surfels = view.clear & (grey > LIT_FRACTION * grey.max())
     radiance = interpolated(float64(picture), pixels[surfels])
-    return np.asarray(
-        np.pi
-        * np.median(radiance / (irradiance[surfels] * albedo[surfels, None]), axis=0)
+    return np.pi * np.median(
+        radiance / (irradiance[surfels] * albedo[surfels, None]), axis=0
     )
 
 

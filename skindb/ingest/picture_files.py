@@ -99,7 +99,7 @@ def _png(content: bytes) -> Picture:
         with Image.open(io.BytesIO(content), formats=("PNG",)) as image:
             if image.getexif().get(ExifTags.Base.Orientation, 1) != 1:
                 raise ValueError("a turned picture")
-    return np.asarray(imagecodecs.png_decode(content))
+    return imagecodecs.png_decode(content)
 
 
 def _tiff(content: bytes) -> Picture:
@@ -118,4 +118,4 @@ def _tiff(content: bytes) -> Picture:
         }
         if found := [what for what, is_so in wrong.items() if is_so]:
             raise ValueError(", ".join(found))
-        return np.asarray(page.asarray())
+        return page.asarray()

@@ -577,7 +577,7 @@ def _from_ball(folder: Path, files: Sequence[Path]) -> list[Light]:
 def _bright(path: Path) -> Mask:
     """Bright pixels of a mask."""
     picture = read_picture(path)
-    return np.asarray(picture.max(axis=-1) > picture.max() / 2)
+    return picture.max(axis=-1) > picture.max() / 2
 
 
 def _mask(path: Path | None, size: tuple[int, int]) -> Mask:

@@ -81,7 +81,7 @@ def decay_p_values(value: Float64, error: Float64, distance: Float64) -> Float64
     variance = (factor**2 * sigma**2).sum(axis=1)
     level = np.average(slope, axis=0, weights=1 / variance)
     chi_square = ((slope - level) ** 2 / variance).sum(axis=0)
-    return np.asarray(stats.chi2.sf(chi_square, len(value) - 1))
+    return stats.chi2.sf(chi_square, len(value) - 1)
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,7 @@ MIN_CHANGE = 0.1
 # surface, 0.04 for noise; 0.17 to 0.4 for the least hundredth of dark parts of 15 subjects
 MIN_SHARED = 0.2
 NOISE_WINDOW = 5  # points
+MIN_BACKGROUND = 0.01  # of the picture, from which it is noted
 # smallest over largest eigenvalue of the lights' directions, below which they are in a plane
 MIN_SPREAD = 2e-3
 ROUNDS = 5  # of reweighting; the weights of a sixth differ by less than a percent
@@ -62,7 +63,7 @@ MIN_MIXED = 100
 WRONG_AXES_RATIO = 1.15
 MIN_CONVEXITY = -0.1
 MIN_TILT = 0.2  # RMS sine of the normals to their mean; those subjects have 0.55 to 0.7
-# what the misfits of wrong axes are of
+# what the misfits are of
 WRONG_AXES = ("", "mirrored", "exchanged in x and y", "turned by 90 degrees")
 MIN_COSINE = 0.1  # to the camera; slopes beyond it are not measurable
 # of neighbouring points: depth over width, from which the surface is torn apart
@@ -80,8 +81,7 @@ class Relief:
     surface: CleanMesh
     lit: Mask  # (light, rows, columns) of the grid
     step: int  # pixels between the points of the grid
-    background: float  # fraction of the picture that is noise of a dark background
-    wrong_axes: str  # how and why the lights seem to be wrong; empty if they do not
+    notes: list[str]  # on the background and on the lights
 
     def light_fraction(self, camera: CameraRecord, position: Float64) -> Half:
         """Whether each surfel (n, light) at `position` (n, 3) is lit: 1 or 0."""
@@ -156,14 +156,18 @@ def estimate_relief(
     if surface.report["turned_mesh"]:  # a hollow surface faces the camera, too
         report = surface.report | {"turned_mesh": 0}
         surface = replace(surface, faces=surface.faces[:, ::-1], report=report)
-    return Relief(
-        Scan(vertices, faces),
-        surface,
-        lit,
-        step,
-        background,
-        _wrong_axes(normal @ camera.R.T),
-    )
+    notes = []
+    if background > MIN_BACKGROUND:
+        notes.append(
+            f"{background:.0%} of the picture is a dark background with noise and is "
+            "excluded; a mask states the subject"
+        )
+    if wrong := _wrong_axes(normal @ camera.R.T):
+        notes.append(
+            f"the lights seem to be {wrong}: check that x of their directions is to the "
+            "right, y up and z to the camera"
+        )
+    return Relief(Scan(vertices, faces), surface, lit, step, notes)
 
 
 def _grey_pictures(
@@ -218,7 +222,7 @@ def _is_noise(values: Float32) -> Mask:
         change = np.nan_to_num(picture) - mean
         shared += uniform_filter(change, NOISE_WINDOW) ** 2
         total += change**2
-    return np.asarray(shared <= MIN_SHARED * uniform_filter(total, NOISE_WINDOW))
+    return shared <= MIN_SHARED * uniform_filter(total, NOISE_WINDOW)
 
 
 def _near(dome: DomeRecord, distance: float, rays: Float64) -> bool:
@@ -324,13 +328,14 @@ def _wrong_axes(normal: Float64) -> str:
     misfit = [np.median(np.abs(pair[known])) for pair in pairs]
     if misfit[0] > WRONG_AXES_RATIO * min(misfit):
         return f"{WRONG_AXES[np.argmin(misfit)]}, as no surface has these normals"
-    place = np.argwhere(np.isfinite(normal[..., 2]))[:, ::-1].astype(np.float64)
-    place -= place.mean(axis=0)
-    tilt = normal[np.isfinite(normal[..., 2]), :2]
+    known_normal = np.isfinite(normal[..., 2])
+    place = np.argwhere(known_normal)[:, ::-1]
+    place = place - place.mean(axis=0)
+    tilt = normal[known_normal, :2]
     tilt -= tilt.mean(axis=0)
     if np.sqrt(2 * np.mean(tilt**2)) < MIN_TILT:
         return ""  # flat things, such as coins, are hollow by noise
-    outwards = (place * tilt).sum() / np.sqrt((place**2).sum() * (tilt**2).sum())
+    outwards = np.vdot(place, tilt) / (np.linalg.norm(place) * np.linalg.norm(tilt))
     convexity = outwards + np.sign(ax + dy)[known].mean()
     if convexity < MIN_CONVEXITY:
         return "turned by 180 degrees, as the surface is hollow"
@@ -386,7 +391,7 @@ def _robust_heights(
         residual = np.abs(difference @ height - slope)
         scale = np.median(residual) / 0.6745
         used = weight / (1 + (residual / max(CAUCHY * scale, 1e-12)) ** 2)
-    return np.asarray(height)
+    return height
 
 
 def _faces(known: Mask, depth: Float64, width: float) -> Index:

@@ -71,7 +71,7 @@ class SurfelSet:
         """Cosine (n,) between normals and the direction to the camera."""
         way = camera.centre - self.position[part]
         cosine = dots(way, self.normal[part])
-        return np.asarray(cosine / lengths(way))
+        return cosine / lengths(way)
 
     def spacing(self) -> float:
         """Distance [mm] of neighbours in an even lattice of the same density."""
@@ -222,7 +222,7 @@ def _site_position(
     points = surfels.position[member]
     area = surfels.area[member]
     middle = area @ points / area.sum()
-    return np.asarray(points[lengths(points - middle).argmin()])
+    return points[lengths(points - middle).argmin()]
 
 
 def _regions(
@@ -247,7 +247,7 @@ def blended_lobes(
         strength[regions[name]] = lobes[name]
     nodes = np.linspace(0, len(position) - 1, BLEND_NODES).astype(np.int64)
     near = cKDTree(position[nodes]).query(position, BLENDED)[1]
-    return np.asarray(strength[nodes[near]].mean(axis=1))
+    return strength[nodes[near]].mean(axis=1)
 
 
 def light_visibility(
@@ -425,17 +425,15 @@ def _clear(
     """Whether the pixels around surfels show the surface that their tangent planes predict."""
     distance, rays = depth_map(camera, scene, pixels[indices])
     focal_px = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
-    return np.asarray(
-        matches_tangent_plane(
-            surfels.position,
-            surfels.normal,
-            pixels,
-            indices,
-            camera.centre,
-            rays,
-            distance,
-            EDGE_PX,
-            DEPTH_SLACK,
-            EDGE_PX * MAX_DEPTH_SLOPE / focal_px,
-        )
+    return matches_tangent_plane(
+        surfels.position,
+        surfels.normal,
+        pixels,
+        indices,
+        camera.centre,
+        rays,
+        distance,
+        EDGE_PX,
+        DEPTH_SLACK,
+        EDGE_PX * MAX_DEPTH_SLOPE / focal_px,
     )

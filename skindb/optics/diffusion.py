@@ -25,7 +25,7 @@ def diffuse_reflectance(s: ArrayLike, *, eta: float) -> Array:
     s = float64(s)
     albedo = 1.0 - s * s / 3.0
     far = np.exp(-_steepness(eta) * s)
-    return np.asarray(albedo / 2.0 * (1.0 + far) * np.exp(-s))
+    return albedo / 2.0 * (1.0 + far) * np.exp(-s)
 
 
 def dipole_s(diffuse: ArrayLike, *, eta: float) -> tuple[Array, Mask]:
@@ -62,7 +62,7 @@ def dipole_s(diffuse: ArrayLike, *, eta: float) -> tuple[Array, Mask]:
 
 def reduced_albedo(s: ArrayLike) -> Array:
     """Alpha' = 1 - s^2 / 3."""
-    return np.asarray(1.0 - np.square(float64(s)) / 3.0)
+    return 1.0 - np.square(float64(s)) / 3.0
 
 
 def scattering_coefficients(s: ArrayLike, sigma_tr: ArrayLike) -> tuple[Array, Array]:
@@ -83,7 +83,7 @@ def _absorbed(s: Array, eta: float) -> Array:
     near = np.exp(-s)
     far = np.exp(-(1.0 + _steepness(eta)) * s)
     lost = -(np.expm1(-s) + np.expm1(-(1.0 + _steepness(eta)) * s)) / 2.0
-    return np.asarray(lost + s * s / 6.0 * (near + far))
+    return lost + s * s / 6.0 * (near + far)
 
 
 def _slope(s: Array, eta: float) -> Array:
@@ -92,14 +92,14 @@ def _slope(s: Array, eta: float) -> Array:
     near = np.exp(-s)
     far = np.exp(-b * s)
     albedo = 1.0 - s * s / 3.0
-    return np.asarray(albedo / 2.0 * (near + b * far) + s / 3.0 * (near + far))
+    return albedo / 2.0 * (near + b * far) + s / 3.0 * (near + far)
 
 
 def sigma_tr(sigma_a: ArrayLike, sigma_s_prime: ArrayLike) -> Array:
     """sigma_tr = sqrt(3 sigma_a (sigma_a + sigma_s')) in mm^-1 (eq. 9)."""
     a = float64(sigma_a)
     s = float64(sigma_s_prime)
-    return np.asarray(np.sqrt(3.0 * a * (a + s)))
+    return np.sqrt(3.0 * a * (a + s))
 
 
 def dipole_profile(
@@ -116,7 +116,7 @@ def dipole_profile(
         d = np.sqrt(r * r + z * z)
         # in this order 0 at infinity, instead of infinity times 0
         total = total + z * (1.0 / d + decay) / (d * d) * np.exp(-decay * d)
-    return np.asarray(s / (a + s) / (4.0 * np.pi) * total)
+    return s / (a + s) / (4.0 * np.pi) * total
 
 
 def _sources(a: Array, s: Array, eta: float) -> tuple[Array, tuple[Array, Array]]:

@@ -34,7 +34,7 @@ def fresnel_reflectance(cos_i: ArrayLike, eta: float) -> Array:
 
 def fresnel_transmittance(cos_i: ArrayLike, eta: float) -> Array:
     """F_t = 1 - F_r."""
-    return np.asarray(1.0 - fresnel_reflectance(cos_i, eta))
+    return 1.0 - fresnel_reflectance(cos_i, eta)
 
 
 def circular_reversal(cos_i: ArrayLike, eta: float) -> Array:
@@ -47,7 +47,7 @@ def circular_reversal(cos_i: ArrayLike, eta: float) -> Array:
     c = np.clip(np.abs(float64(cos_i)), 0.0, 1.0)
     g = np.sqrt(np.maximum(eta * eta - 1.0 + c * c, 0.0))
     ratio = (c * (g + c) - 1.0) / (c * (g - c) + 1.0)  # r_p / -r_s
-    return np.asarray(2.0 * ratio / (1.0 + ratio * ratio))
+    return 2.0 * ratio / (1.0 + ratio * ratio)
 
 
 @lru_cache(maxsize=32)

@@ -112,7 +112,7 @@ def transport_profile(
         near = np.log(NEAREST / radius)
         far = np.minimum(2 * np.log(FARTHEST / radius), 0)
     outside = np.where(radius < NEAREST, near, far)
-    return np.asarray(s * s * np.exp(level + outside))
+    return s * s * np.exp(level + outside)
 
 
 @lru_cache(maxsize=4)
@@ -173,7 +173,7 @@ def _near_polynomial(
     x = np.vander(np.log(ring / SEAM), POWERS + 1, increasing=True)[:, 1:]
     solution = np.linalg.lstsq(x / error[:, None], (value - level) / error, rcond=None)
     powers = np.vander(np.log(r / SEAM), POWERS + 1, increasing=True)[:, 1:]
-    return np.asarray(powers @ solution[0])
+    return powers @ solution[0]
 
 
 @dataclass(frozen=True)
@@ -221,7 +221,7 @@ def _harmonics(n: Index, m: Index, x: Array) -> Array:
     """(x, lm) normalised associated Legendre functions, orthonormal over [-1, 1] at equal m."""
     logarithm = np.log(n + 0.5) + gammaln(n - m + 1) - gammaln(n + m + 1)
     scale = np.exp(logarithm / 2) * (-1.0) ** m
-    return np.asarray(lpmv(m, n, x[:, None]) * scale)
+    return lpmv(m, n, x[:, None]) * scale
 
 
 def _half_range(eta: float) -> tuple[Array, Array]:

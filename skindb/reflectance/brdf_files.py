@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
-from skindb.errors import Fault, InputError, input_error
+from skindb.errors import Fault, InputError, input_error, require
 from skindb.files import private_file
 from skindb.optics.angles import half_difference
 from skindb.reflectance.dictionary import (
@@ -85,13 +85,13 @@ def read_tables(path: str | Path) -> Dictionary:
     ]
     table = np.stack([table for table, _ in resampled], axis=-1)
     albedo = directional_albedo(table, 1.0)[0]
-    if albedo.max() > 2:  # more than an error of measurement explains
-        raise input_error(
-            f"{path}[{TABLE}]",
-            "a surface must not reflect more light than it receives",
-            f"an albedo of {albedo.max():.3g} at normal incidence",
-            "provide values in sr^-1",
-        )
+    require(
+        albedo.max() <= 2,  # more than an error of measurement explains
+        f"{path}[{TABLE}]",
+        "a surface must not reflect more light than it receives",
+        f"an albedo of {albedo.max():.3g} at normal incidence",
+        "provide values in sr^-1",
+    )
     names = (
         tuple(map(str, arrays["names"]))
         if "names" in arrays
@@ -168,7 +168,7 @@ def _channel_mean(brdf: AnyArray) -> Array:
     Materials are processed one at a time, as all of them take gigabytes.
     """
     grey = brdf.astype(np.float64)
-    return np.asarray(grey.mean(axis=-1) if grey.ndim == 4 else grey)
+    return grey.mean(axis=-1) if grey.ndim == 4 else grey
 
 
 Faults = Iterator[tuple[str, ...]]  # array, rule, what was found, cure if there is one
@@ -293,13 +293,13 @@ def read_merl(path: str | Path) -> tuple[Array, int]:
         raise input_error(str(path), rule, content, "download it again")
     values = np.frombuffer(data[12:], "<f8").reshape(3, *SHAPE)
     wrong = int((~np.isfinite(values)).sum())
-    if wrong:
-        raise input_error(
-            str(path),
-            "values must be finite",
-            f"{wrong} that are not",
-            "download it again",
-        )
+    require(
+        not wrong,
+        str(path),
+        "values must be finite",
+        f"{wrong} that are not",
+        "download it again",
+    )
     table = np.moveaxis(values, 0, -1) * SCALE
     hole = np.asarray((table < 0).any(axis=-1))
     if hole.all():
@@ -337,13 +337,13 @@ def read_merl_folder(path: str | Path) -> Dictionary:
         With the faults of all damaged files.
     """
     files = sorted(Path(path).glob("*.binary"))
-    if not files:
-        raise input_error(
-            str(path),
-            "the folder must contain MERL .binary files",
-            "none",
-            "choose their folder, or an .npz file of tables",
-        )
+    require(
+        files,
+        str(path),
+        "the folder must contain MERL .binary files",
+        "none",
+        "choose their folder, or an .npz file of tables",
+    )
     # centres of bins; theta_h is quadratic
     h, d, p = ((np.arange(n) + 0.5) / n for n in SHAPE)
     nodes = (h**2 * np.pi / 2, d * np.pi / 2, p * np.pi)
@@ -420,7 +420,7 @@ def _interpolated(
     axes = (np.sqrt(nodes[0]), nodes[1], phi)
     values = brdf[:, :, np.arange(-1, n + 1) % n]
     interpolator = RegularGridInterpolator(axes, values, bounds_error=False)
-    return np.asarray(interpolator((np.sqrt(theta_h), theta_d, phi_d)))
+    return interpolator((np.sqrt(theta_h), theta_d, phi_d))
 
 
 def _resampling_error(brdf: Array, nodes: Nodes, table: Table) -> float:

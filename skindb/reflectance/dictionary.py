@@ -215,7 +215,7 @@ def weighted_error(values: Array, exact: Array, wi: Array, wo: Array) -> Array:
     """Relative rms error (m,) of values (n, m), weighted by both cosines."""
     weight = (wi[:, 2] * wo[:, 2])[:, None]
     total = np.maximum((weight * exact**2).sum(axis=0), 1e-300)
-    return np.asarray(np.sqrt((weight * (values - exact) ** 2).sum(axis=0) / total))
+    return np.sqrt((weight * (values - exact) ** 2).sum(axis=0) / total)
 
 
 @cache

@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 import xarray as xr
 
-from skindb.errors import input_error
+from skindb.errors import require
 from skindb.reflectance import _ggx_kernels
 from skindb.reflectance._ggx_kernels import (
     MAX_ROUGHNESS,
@@ -95,13 +95,13 @@ class GGX:
     @classmethod
     def unfitted(cls, request: FitRequest) -> GGX:
         """The model before a fit; there is none of a dictionary."""
-        if request.dictionary is not None:
-            raise input_error(
-                "dictionary",
-                "mixtures alone are of a dictionary",
-                "ggx",
-                "omit it, or fit a mixture",
-            )
+        require(
+            request.dictionary is None,
+            "dictionary",
+            "mixtures alone are of a dictionary",
+            "ggx",
+            "omit it, or fit a mixture",
+        )
         return cls(request.eta, request.disc_angular_radius)
 
     @classmethod
@@ -234,7 +234,7 @@ class GGX:
         """Fraction (n,) of light along the normal that the lobes reflect."""
         nodes, albedo = _normal_albedo(self.index)
         fraction = np.interp(parameters[:, ROUGHNESS], nodes, albedo[0])
-        return np.asarray(parameters[:, STRENGTH] * fraction)
+        return parameters[:, STRENGTH] * fraction
 
     def simplified(self, parameters: Array) -> tuple[GGX, Array, tuple[Omission, ...]]:
         """The model as it is."""

@@ -7,7 +7,7 @@ from collections.abc import Container
 import numpy as np
 import xarray as xr
 
-from skindb.errors import input_error
+from skindb.errors import require
 from skindb.reflectance.ggx import GGX
 from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.model import FitRequest, ReflectanceModel, SurfaceKind
@@ -49,7 +49,7 @@ def even_diffuse(fitted: xr.Dataset) -> Array:
     surface reflects evenly.
     """
     even = np.float32(fitted.get(variables.EVEN_REFLECTION, 0.0))
-    return np.asarray(fitted[variables.DIFFUSE_REFLECTANCE].values + even)
+    return fitted[variables.DIFFUSE_REFLECTANCE].values + even
 
 
 def as_mixture(model: xr.DataTree) -> xr.DataTree:
@@ -81,10 +81,10 @@ def as_mixture(model: xr.DataTree) -> xr.DataTree:
 
 def require_mixture(names: Container[object], place: str) -> None:
     """Raise `InputError` unless `names` has the weights of a dictionary."""
-    if "dictionary_weight" not in names and "dictionary" not in names:
-        raise input_error(
-            place,
-            "edits and studies of BRDFs need mixtures of measured BRDFs",
-            "another surface model",
-            "fit with --surface mixture",
-        )
+    require(
+        "dictionary_weight" in names or "dictionary" in names,
+        place,
+        "edits and studies of BRDFs need mixtures of measured BRDFs",
+        "another surface model",
+        "fit with --surface mixture",
+    )

@@ -35,7 +35,7 @@ def evaluate_lobe(wi: Array, wo: Array, alpha: Array | float, index: float) -> A
     shadow = camera * np.sqrt(square + (1 - square) * light**2)
     shadow = shadow + light * np.sqrt(square + (1 - square) * camera**2)
     cos_d = np.clip((half * wi).sum(axis=-1), 0.0, 1.0)
-    return np.asarray(fresnel_reflectance(cos_d, index) * spread / (2 * shadow))
+    return fresnel_reflectance(cos_d, index) * spread / (2 * shadow)
 
 
 def evaluate_graded(wi: Array, wo: Array) -> Array:

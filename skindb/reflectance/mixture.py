@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 import xarray as xr
 
-from skindb.errors import input_error
+from skindb.errors import require
 from skindb.reflectance import _row_kernels
 from skindb.reflectance._block_kernels import Tables, fit_block
 from skindb.reflectance.block import (
@@ -123,13 +123,13 @@ class Mixture:
         """Mixtures of all BRDFs of the dictionary, which must have at least k of them."""
         tables = disc_dictionary(request.dictionary, request.disc_angular_radius)
         count = len(tables.names)
-        if request.k > count:  # checked before the fit
-            raise input_error(
-                "k",
-                f"a reduced basis of this dictionary has 1 to {count} components",
-                str(request.k),
-                "choose a smaller k",
-            )
+        require(  # before the fit
+            request.k <= count,
+            "k",
+            f"a reduced basis of this dictionary has 1 to {count} components",
+            str(request.k),
+            "choose a smaller k",
+        )
         return cls.of_dictionary(tables, rank=request.rank)
 
     @classmethod
@@ -167,7 +167,7 @@ class Mixture:
     @cached_property
     def normal_albedo(self) -> Array:
         """Fraction (r,) of light along the normal that each table reflects."""
-        return np.asarray(directional_albedo(self.table, 1.0)[0])
+        return directional_albedo(self.table, 1.0)[0]
 
     @cached_property
     def narrow_albedo(self) -> Array:
@@ -220,7 +220,7 @@ class Mixture:
 
     def parameters_of(self, fitted: xr.Dataset) -> Array:
         """Weights (n, m) of the surfels."""
-        return np.asarray(fitted[self.parameter_variables[0]].values)
+        return fitted[self.parameter_variables[0]].values
 
     def fit(
         self,
@@ -304,7 +304,7 @@ class Mixture:
 
     def normal_reflectance(self, parameters: Array) -> Array:
         """Fraction (n,) of light along the normal that mixtures (n, m) reflect."""
-        return np.asarray(parameters @ self.normal_albedo)
+        return parameters @ self.normal_albedo
 
     def simplified(
         self, parameters: Array
@@ -381,7 +381,7 @@ def basis_rows(
 def _above_horizon(normal: Array, away: Array) -> Mask:
     """(n, d) mask of directions above the horizon; false for NaN and infinite ones."""
     cosine = np.einsum("sc,sdc->sd", normal, away)
-    return np.asarray(np.isfinite(cosine) & (cosine > 0))
+    return np.isfinite(cosine) & (cosine > 0)
 
 
 def _read_only(array: AnyArray) -> AnyArray:

@@ -23,7 +23,7 @@ import xarray as xr
 from scipy.optimize import minimize
 
 from skindb.cache import cached_arrays
-from skindb.errors import input_error
+from skindb.errors import input_error, require
 from skindb.numerics.factorise import nmf
 from skindb.numerics.nnls import solve_nnls
 from skindb.optics.angles import directions
@@ -123,7 +123,7 @@ def _cell_weight(mean: Array, grid: TableGrid) -> Array:
     pairs = np.sin(th) * np.sqrt(np.maximum(th, 1e-4)) * np.sin(td) * np.cos(td) + 1e-6
     measure = np.maximum(wi[..., 2] * wo[..., 2], 0.0) * pairs
     measure[np.minimum(wi[..., 2], wo[..., 2]) < 0.05] = 0.0
-    return np.asarray(measure.ravel() ** 0.25 / np.sqrt(np.maximum(mean, 1e-6)))
+    return measure.ravel() ** 0.25 / np.sqrt(np.maximum(mean, 1e-6))
 
 
 @lru_cache(maxsize=2)
@@ -240,13 +240,13 @@ def reduce_basis(
     weight = fitted["dictionary_weight"].values
     area = np.maximum(fitted["surfel_area"].values.astype(np.float64), 0) + 1e-12
     limit = min(len(good), weight.shape[1])
-    if not 1 <= k <= limit:
-        raise input_error(
-            "k",
-            f"a reduced basis has 1 to {limit} components here",
-            str(k),
-            "choose another k",
-        )
+    require(
+        1 <= k <= limit,
+        "k",
+        f"a reduced basis has 1 to {limit} components here",
+        str(k),
+        "choose another k",
+    )
     count = min(MAX_SAMPLED_SURFELS, len(good))
     chosen = good[np.sort(rng.choice(len(good), count, replace=False))]
     # of coefficients, the choice of the paper: errors between BRDFs (`brdf_metric`) gave
@@ -280,7 +280,7 @@ def _mean_weight(weight: Array, area: Array, good: Index) -> Array:
     # in parts: a million surfels in double precision would take half a gigabyte
     parts = (good[i : i + PART] for i in range(0, len(good), PART))
     sums = [area[part] @ weight[part].astype(np.float64) for part in parts]
-    return np.asarray(np.sum(sums, axis=0) / area[good].sum())
+    return np.sum(sums, axis=0) / area[good].sum()
 
 
 def fitted_surfels(fitted: xr.Dataset, names: Sequence[str]) -> Index:
@@ -473,7 +473,7 @@ def _descend(systems: Systems, lift: Array, H: Array, *, steps: int = STEPS) -> 
         bounds=[(0, None)] * H.size,
         options=options,
     )
-    return np.asarray(minimum.x.reshape(H.shape) / norm)
+    return minimum.x.reshape(H.shape) / norm
 
 
 def _cheapest_merges(systems: Systems, lift: Array, H: Array) -> list[Array]:

@@ -106,7 +106,7 @@ class TableSampler:
             + cosine[:, None] * normal
         )
         mirror = 2 * dots(view, drawn)[:, None] * drawn - view
-        return np.asarray(np.where(lobe[:, None], mirror, drawn))
+        return np.where(lobe[:, None], mirror, drawn)
 
     def pdf(self, mix: Array, normal: Array, view: Array, towards: Array) -> Array:
         """Density (n,) per steradian with which `sample` draws the directions `towards`
@@ -128,12 +128,10 @@ class TableSampler:
             / solid
             / (4 * np.maximum(cos_d, MIN_COSINE_HALF))
         )
-        return np.asarray(
-            np.where(
-                cosine > 0,
-                mix[:, 0] * cosine / np.pi + np.where(cos_h > 0, lobes, 0.0),
-                0.0,
-            )
+        return np.where(
+            cosine > 0,
+            mix[:, 0] * cosine / np.pi + np.where(cos_h > 0, lobes, 0.0),
+            0.0,
         )
 
 

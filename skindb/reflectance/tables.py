@@ -37,7 +37,7 @@ class TableGrid:
     @property
     def theta_h(self) -> Array:
         """(nh,) rad."""
-        return np.asarray(np.linspace(0.0, 1.0, self.n_theta_h) ** 2 * np.pi / 2)
+        return np.linspace(0.0, 1.0, self.n_theta_h) ** 2 * np.pi / 2
 
     @property
     def theta_d(self) -> Array:
@@ -47,7 +47,7 @@ class TableGrid:
     @property
     def phi_d(self) -> Array:
         """(np,) rad."""
-        return np.asarray(np.arange(self.n_phi_d) * np.pi / self.n_phi_d)
+        return np.arange(self.n_phi_d) * np.pi / self.n_phi_d
 
 
 # Interpolation error of the 59 materials, weighted by both cosines, median of the rms:

@@ -173,13 +173,13 @@ class Archive:
         """A state; `InputError` if it does not exist or is damaged."""
         key = f"{STATES}/{number:06d}.json"
         numbers = self.numbers()
-        if number not in numbers:
-            raise input_error(
-                self.place.name,
-                f"state {number} must exist",
-                f"states {', '.join(map(str, numbers)) or 'none'}",
-                "see skindb restore --list",
-            )
+        require(
+            number in numbers,
+            self.place.name,
+            f"state {number} must exist",
+            f"states {', '.join(map(str, numbers)) or 'none'}",
+            "see skindb restore --list",
+        )
         with damage_as_fault(self.place.where(key), AS_WRITTEN, CURE_STATE):
             body = sealed_object(self.place.read_small(key))
             require_format("state", body.pop("format"), FORMAT)
@@ -328,13 +328,13 @@ def require_apart(backup: Place, database: Place) -> None:
     """
     inner = backup.url(FILES).removesuffix(FILES)
     outer = database.url(FILES).removesuffix(FILES)
-    if inner.startswith(outer) or outer.startswith(inner):
-        raise input_error(
-            backup.name,
-            "a backup must not be inside its database, nor the database inside it",
-            f"the database {database.name}",
-            "give another folder",
-        )
+    require(
+        not (inner.startswith(outer) or outer.startswith(inner)),
+        backup.name,
+        "a backup must not be inside its database, nor the database inside it",
+        f"the database {database.name}",
+        "give another folder",
+    )
 
 
 def read_item(place: Place, key: str, item: Item) -> bytes:

@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 from zarr.abc.store import ByteRequest, Store
 from zarr.core.buffer import Buffer, BufferPrototype
 
-from skindb.errors import InputError, UnavailableError, input_error
+from skindb.errors import InputError, UnavailableError, input_error, require
 from skindb.files import cache_folder, make_private
 from skindb.limits import MAX_STORE_JSON_BYTES
 from skindb.store.folder import Folder
@@ -380,13 +380,13 @@ class Bucket:
         of a commit is a manifest, not a record.
         """
         with suppress(UnavailableError):  # checked with the next object
-            if not self._is_conditional and self._put_new(path, data):
-                raise input_error(
-                    self.name,
-                    "the server must support conditional put (If-None-Match)",
-                    "a server that overwrites objects",
-                    "use another server, or a newer version of it",
-                )
+            require(
+                self._is_conditional or not self._put_new(path, data),
+                self.name,
+                "the server must support conditional put (If-None-Match)",
+                "a server that overwrites objects",
+                "use another server, or a newer version of it",
+            )
             self._is_conditional = True
 
     def _put(self, path: str, data: bytes) -> str:
@@ -516,8 +516,11 @@ def place_at(url: str) -> Place:
             "a different URL",
             "give a folder, or s3://BUCKET/PREFIX",
         )
-    if Path(url).exists() and not Path(url).is_dir():
-        raise input_error(
-            url, "a database must be a folder", "a file", "choose another folder"
-        )
+    require(
+        Path(url).is_dir() or not Path(url).exists(),
+        url,
+        "a database must be a folder",
+        "a file",
+        "choose another folder",
+    )
     return Folder(Path(url))

@@ -112,10 +112,13 @@ def cohort(
 ) -> Dataset:
     """See `Database.cohort`."""
     layout = request.layout
-    if layout not in GROUP:
-        raise input_error(
-            "layout", f"must be one of {', '.join(GROUP)}", repr(layout), "choose one"
-        )
+    require(
+        layout in GROUP,
+        "layout",
+        f"must be one of {', '.join(GROUP)}",
+        repr(layout),
+        "choose one",
+    )
     require(
         dim in ("take", "subject"),
         "dim",

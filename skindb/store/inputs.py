@@ -7,7 +7,7 @@ A subject may be withdrawn, or change the consent, while the version is computed
 from collections.abc import Iterable
 from functools import partial
 
-from skindb.errors import Fault, InputError, input_error
+from skindb.errors import Fault, InputError, require
 from skindb.files import Attributes
 from skindb.schema.consent import CONSENT, consent_scope
 from skindb.store.log import Log
@@ -90,14 +90,14 @@ def require_own_subject(kind: str, take: str, names: Iterable[str]) -> None:
     another subject.
     """
     foreign = sorted(name for name in names if subject_of(name) != subject_of(take))
-    if kind in KINDS_OF_ONE_SUBJECT and foreign:
-        raise input_error(
-            f"{kind} of {take}",
-            f"a {kind} must refer to takes of its own subject only",
-            f"a reference to {', '.join(foreign)}",
-            "commit what many subjects share as a kind of its own, and name that "
-            "version as the input",
-        )
+    require(
+        not foreign or kind not in KINDS_OF_ONE_SUBJECT,
+        f"{kind} of {take}",
+        f"a {kind} must refer to takes of its own subject only",
+        f"a reference to {', '.join(foreign)}",
+        "commit what many subjects share as a kind of its own, and name that "
+        "version as the input",
+    )
 
 
 def require_consents(

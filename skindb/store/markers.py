@@ -49,7 +49,7 @@ from skindb.errors import (
     SkindbWarning,
     UnavailableError,
     attempt,
-    input_error,
+    require,
     system_fault,
 )
 from skindb.files import Attributes, Json, make_private, private_file, read_regular
@@ -200,8 +200,13 @@ def _hashes(place: Place) -> frozenset[str]:
     """Keyed hash of every subject that was withdrawn."""
     names = place.sizes(WITHDRAWN)
     for name, (finding, cure) in LOCKS.items():
-        if name in names and not place.is_unlocked:
-            raise input_error(place.name, "must be a complete database", finding, cure)
+        require(
+            name not in names or place.is_unlocked,
+            place.name,
+            "must be a complete database",
+            finding,
+            cure,
+        )
     return withdrawn_hashes(names)
 
 

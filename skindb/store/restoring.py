@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from skindb.errors import Fault, input_error
+from skindb.errors import Fault, input_error, require
 from skindb.schema.consent import CONSENT
 from skindb.store.archive import (
     Archive,
@@ -114,14 +114,14 @@ def restore(
     """
     place = place_at(url)
     file = markers or place.marker_file()
-    if not without_markers and not file.exists():
-        raise input_error(
-            str(file),
-            "a restore needs the marker file, because subjects who were withdrawn "
-            "after the backup would come back",
-            "no such file",
-            "give --markers FILE, or --without-markers to accept this risk",
-        )
+    require(
+        without_markers or file.exists(),
+        str(file),
+        "a restore needs the marker file, because subjects who were withdrawn "
+        "after the backup would come back",
+        "no such file",
+        "give --markers FILE, or --without-markers to accept this risk",
+    )
     archive = Archive(place_at(source))
     archive.require()
     place.is_unlocked = True

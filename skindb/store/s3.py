@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from skindb.errors import Fault, UnavailableError, input_error
+from skindb.errors import Fault, UnavailableError, input_error, require
 
 if TYPE_CHECKING:
     from obstore.store import BackoffConfig, S3Store
@@ -57,26 +57,26 @@ def bucket_and_prefix(url: str) -> tuple[str, str]:
         If the URL has a different form, or contains credentials, which the message does not repeat.
     """
     rest = url.removeprefix("s3://").rstrip("/")
-    if "@" in rest or "?" in rest:
-        raise input_error(
-            "s3://...",
-            "the URL of a database must not contain credentials or options",
-            "some",
-            CURE_NO_KEYS,
-        )
+    require(
+        "@" not in rest and "?" not in rest,
+        "s3://...",
+        "the URL of a database must not contain credentials or options",
+        "some",
+        CURE_NO_KEYS,
+    )
     bucket, _, prefix = rest.partition("/")
     parts = prefix.split("/") if prefix else []
     usable = all(
         re.fullmatch(PREFIX_PART, part) and part not in (".", "..") for part in parts
     )
-    if not (usable and re.fullmatch(BUCKET, bucket)):
-        raise input_error(
-            url,
-            "must be s3://BUCKET/PREFIX of lower-case letters, digits, '.', '-'; "
-            "PREFIX also of capitals, '_', '='",
-            "a different form",
-            "choose another name",
-        )
+    require(
+        usable and re.fullmatch(BUCKET, bucket),
+        url,
+        "must be s3://BUCKET/PREFIX of lower-case letters, digits, '.', '-'; "
+        "PREFIX also of capitals, '_', '='",
+        "a different form",
+        "choose another name",
+    )
     return bucket, prefix
 
 
@@ -100,11 +100,14 @@ def connect(bucket: str, prefix: str) -> S3Store:
             "it is not installed",
             "pip install 'skindb[s3]'",
         ) from None
-    if not set(SOURCES) & os.environ.keys() and not _is_on_aws():
-        # without the metadata service of AWS the request times out after a minute
-        raise input_error(
-            f"s3://{bucket}", "credentials must be set", "none", CURE_NO_KEYS
-        )
+    # without the metadata service of AWS the request times out after a minute
+    require(
+        set(SOURCES) & os.environ.keys() or _is_on_aws(),
+        f"s3://{bucket}",
+        "credentials must be set",
+        "none",
+        CURE_NO_KEYS,
+    )
     pauses: BackoffConfig = {
         "init_backoff": FIRST_PAUSE,
         "max_backoff": LONGEST_PAUSE,
@@ -147,13 +150,13 @@ def endpoint() -> str:
         return ""
     parts = urlsplit(address)
     host = parts.hostname or ""
-    if not re.fullmatch(r"https?://[^@/?#]+/?", address) or not host:
-        raise input_error(
-            "AWS_ENDPOINT_URL",
-            "must be http(s)://HOST:PORT without credentials",
-            "a different URL",
-            "correct it",
-        )
+    require(
+        host and re.fullmatch(r"https?://[^@/?#]+/?", address),
+        "AWS_ENDPOINT_URL",
+        "must be http(s)://HOST:PORT without credentials",
+        "a different URL",
+        "correct it",
+    )
     loopback = host in ("localhost", "::1") or host.startswith("127.")
     if (
         parts.scheme == "http"
@@ -188,13 +191,13 @@ def readable_errors(location: str) -> Iterator[None]:
 
     if not _OBSTORE_PROCESS:
         _OBSTORE_PROCESS.append(os.getpid())
-    elif _OBSTORE_PROCESS[0] != os.getpid():
-        raise input_error(
-            location,
-            "a process that uses a bucket must not be forked from another one that does",
-            "a forked process",
-            "use the workers of skindb, loky or Dask, or the start method spawn",
-        )
+    require(
+        _OBSTORE_PROCESS[0] == os.getpid(),
+        location,
+        "a process that uses a bucket must not be forked from another one that does",
+        "a forked process",
+        "use the workers of skindb, loky or Dask, or the start method spawn",
+    )
     try:
         yield
     except AlreadyExistsError:

@@ -14,7 +14,7 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from skindb.errors import Fault, InputError, input_error
+from skindb.errors import Fault, InputError, input_error, require
 from skindb.schema.consent import CONSENT, consent_scope
 from skindb.store.entries import (
     Entry,
@@ -288,13 +288,13 @@ def pinned_record(records: Records, pins: Pins, kind: str, take: str) -> Record:
         )
     pin = pins[kind, take]
     record = records.record(kind, take, pin["generation"])
-    if record.seal != pin["seal"]:
-        raise input_error(
-            take,
-            f"generation {pin['generation']} of its {kind} must be that of the release",
-            "a different version",
-            "restore it from a backup",
-        )
+    require(
+        record.seal == pin["seal"],
+        take,
+        f"generation {pin['generation']} of its {kind} must be that of the release",
+        "a different version",
+        "restore it from a backup",
+    )
     return record
 
 

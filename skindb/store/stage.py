@@ -18,7 +18,7 @@ from xarray import DataArray, Dataset, Variable
 from zarr.codecs import BloscCodec
 
 from skindb import __version__
-from skindb.errors import Fault, InputError, UnavailableError, add_filename, input_error
+from skindb.errors import Fault, InputError, UnavailableError, add_filename, require
 from skindb.files import Attributes, Json, plain
 from skindb.schema import SCHEMA_VERSION, VARIABLES, check, dataset
 from skindb.schema.label import BLOCK_SURFELS
@@ -261,13 +261,13 @@ class Stage:
         gone = [
             name for name in sorted(self.groups) if f"{name}/zarr.json" not in sizes
         ]
-        if gone:
-            raise input_error(
-                self.log.what,
-                "all groups of a version must exist when it is committed",
-                f"that another process removed {', '.join(gone)}",
-                "run the command again",
-            )
+        require(
+            not gone,
+            self.log.what,
+            "all groups of a version must exist when it is committed",
+            f"that another process removed {', '.join(gone)}",
+            "run the command again",
+        )
         files = {name: size for name, size in sorted(sizes.items()) if size >= 0}
         digests = in_parallel(
             lambda name: self.place.digests(f"{self.path}/{name}"), files
@@ -288,13 +288,13 @@ class Stage:
         kind = self.log.kind
         take = self.log.take
         unnamed = sorted({*takes} - {*self.names} - own_takes(kind, take))
-        if kind not in KINDS_OF_ONE_SUBJECT and unnamed:
-            raise input_error(
-                self.log.what,
-                "a version must name the takes that it refers to before it is written",
-                f"no {', '.join(unnamed[:8])}",
-                f"call db.stage({kind!r}, {take!r}, names=[...])",
-            )
+        require(
+            not unnamed or kind in KINDS_OF_ONE_SUBJECT,
+            self.log.what,
+            "a version must name the takes that it refers to before it is written",
+            f"no {', '.join(unnamed[:8])}",
+            f"call db.stage({kind!r}, {take!r}, names=[...])",
+        )
 
     def _declare(self) -> None:
         """Write which takes the version refers to, before anything else."""

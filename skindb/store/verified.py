@@ -21,7 +21,7 @@ from zarr.abc.store import (
 )
 from zarr.core.buffer import Buffer, BufferPrototype
 
-from skindb.errors import Fault, InputError, input_error
+from skindb.errors import Fault, InputError, input_error, require
 from skindb.store.place import BLOCK_BYTES, Digests, Place, block_digests
 from skindb.store.record import Record, json_object
 
@@ -79,8 +79,13 @@ def read_beside(place: Place, record: Record, suffix: str, digest: str) -> bytes
             place.where(key), AS_COMMITTED, error.strerror or "an unreadable file", CURE
         )
         raise InputError(fault) from None
-    if hashlib.sha256(text).hexdigest() != digest:
-        raise input_error(place.where(key), AS_COMMITTED, CHANGED, CURE)
+    require(
+        hashlib.sha256(text).hexdigest() == digest,
+        place.where(key),
+        AS_COMMITTED,
+        CHANGED,
+        CURE,
+    )
     return text
 
 
