@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from datetime import UTC, datetime
 from typing import Protocol
 
 # of simulated time: a 115,200 baud line needs as long for a message
@@ -58,3 +59,8 @@ class SimulatedClock:
 
 
 SYSTEM_CLOCK: Clock = time  # that of this computer
+
+
+def utc_time() -> str:
+    """Present time by the clock of this computer, ISO 8601 in UTC."""
+    return datetime.now(UTC).isoformat(timespec="seconds")

@@ -17,7 +17,7 @@ from skindb.fit.lumitexels import POLARISATION, cosines, directions
 from skindb.geometry.interreflection import bounce_transfer, tangent_frames
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.schema import check, dataset
-from skindb.types import AnyArray, Array, Float32, Index
+from skindb.types import AnyArray, Array, Float32, Index, float64
 
 # surfels in a camera that are used: twice as many changed gains by 0.1 to 0.4 %, at
 # most 2.2 %
@@ -88,7 +88,7 @@ def estimate_light_gains(
     >>> rng = np.random.default_rng(0)
     >>> gains = estimate_light_gains(lumitexels(capture), rng=rng)  # doctest: +SKIP
     """
-    light = lumitexels["light_position"].values.astype(np.float64)
+    light = float64(lumitexels["light_position"].values)
     matrix = _residual_form(lumitexels, [light], rng=rng, eta=eta)
     gain = _solved(matrix, len(light))[0]
     return dataset(
@@ -185,7 +185,7 @@ def light_residuals(
         Gains and offsets of a calibration, with which the samples were made; default
         none.
     """
-    light = lumitexels["light_position"].values.astype(np.float64)
+    light = float64(lumitexels["light_position"].values)
     away = light - lumitexels["surfel_position"].values.mean(axis=0, dtype=np.float64)
     distance = np.linalg.norm(away, axis=1)[:, None]
     axes = (tangent_frames(away / distance)[:, :2] * distance[:, None]).swapaxes(0, 1)
@@ -214,7 +214,7 @@ def estimate_camera_gains(
         cameras see different parts of the light from the surface.
     """
     few, lights = _chosen(lumitexels, rng)
-    samples = few["reflectance_sample"].values.astype(np.float64)
+    samples = float64(few["reflectance_sample"].values)
     shape = (samples.shape[0], *samples.shape[2:])
     logs = np.full(shape, np.nan)
     for view in _views(few, [lights], eta=eta):
@@ -318,7 +318,7 @@ def _residual_form(
         (p light, p light) for p sets of positions.
     """
     few, _ = _chosen(lumitexels, rng)
-    samples = few["reflectance_sample"].values.astype(np.float64).mean(axis=3)
+    samples = float64(few["reflectance_sample"].values).mean(axis=3)
     matrix = np.zeros((len(lights) * samples.shape[1],) * 2)
     for view in _views(few, lights, eta=eta):
         _add_view(
@@ -337,7 +337,7 @@ def _chosen(
     count = min(-(-VIEWS // lumitexels.sizes["camera"]), surfels)
     chosen = np.sort(rng.choice(surfels, count, replace=False))
     few = lumitexels[list(names)].isel(surfel=chosen).compute()
-    return few, few["light_position"].values.astype(np.float64)
+    return few, float64(few["light_position"].values)
 
 
 class _View(NamedTuple):
@@ -356,7 +356,7 @@ def _views(few: xr.Dataset, lights: Sequence[Array], *, eta: float) -> Iterator[
     """Views of enough lights."""
     finite = np.isfinite(few["reflectance_sample"].values).all(axis=3)
     position, normal, camera = (
-        few[name].values.astype(np.float64) for name in (*NEEDED[:2], NEEDED[3])
+        float64(few[name].values) for name in (*NEEDED[:2], NEEDED[3])
     )
     to_light = directions(position, lights[0])
     to_camera = directions(position, camera)
@@ -485,9 +485,7 @@ def bounced_light(
         faces the light.
     """
     check(lumitexels, NEEDED, where="lumitexels")
-    position, normal, light = (
-        lumitexels[name].values.astype(np.float64) for name in NEEDED[:3]
-    )
+    position, normal, light = (float64(lumitexels[name].values) for name in NEEDED[:3])
     if len(position) != len(visible) or len(position) != len(diffuse):
         counts = f"{len(position)}, {len(visible)} and {len(diffuse)} surfels"
         rule = "samples, visibility and R_d must be of the same surfels"
@@ -538,7 +536,7 @@ def without_bounce(
     it towards each camera.
     """
     position, normal, camera = (
-        lumitexels[name].values.astype(np.float64)
+        float64(lumitexels[name].values)
         for name in ("surfel_position", "surfel_normal", "camera_position")
     )
     seen = cosines(normal, directions(position, camera))

@@ -14,7 +14,7 @@ from skindb.errors import Fault, InputError
 from skindb.parameters import SCAN_ERROR_DEGREES
 from skindb.reflectance.model import UNKNOWN_NOISE, Block, Noise
 from skindb.schema import check, variables
-from skindb.types import AnyArray, Array
+from skindb.types import AnyArray, Array, float64
 
 Arrays = Mapping[str, AnyArray]  # of a block of surfels, by variable
 GEOMETRY = (
@@ -108,7 +108,7 @@ def disc_angle(lumitexels: xr.Dataset) -> float:
     """Median angular radius [rad] of the lights as seen from the middle of the surfels;
     0 for point lights.
     """
-    middle = lumitexels["surfel_position"].values.astype(np.float64).mean(axis=0)
+    middle = float64(lumitexels["surfel_position"].values).mean(axis=0)
     distance = np.linalg.norm(lumitexels["light_position"].values - middle, axis=1)
     radius = lumitexels["light_disc_radius"].values
     return float(np.median(np.arctan2(radius, distance)))
@@ -146,7 +146,7 @@ def _polarisation(arrays: Arrays) -> Array:
     """Products (lights, cameras) of the degrees of polarisation; (0, 0) without polarisers."""
     if not all(name in arrays for name in POLARISATION):
         return np.zeros((0, 0))
-    by_light, by_camera = (arrays[name].astype(np.float64) for name in POLARISATION)
+    by_light, by_camera = (float64(arrays[name]) for name in POLARISATION)
     return np.outer(by_light, by_camera)
 
 
@@ -215,9 +215,9 @@ def sample_variance(
     """
     check(lumitexels, ("reflectance_sample", *NOISE_INPUTS), where="lumitexels")
     sample = lumitexels["reflectance_sample"]
-    arrays = {name: lumitexels[name].values.astype(np.float64) for name in NOISE_INPUTS}
+    arrays = {name: float64(lumitexels[name].values) for name in NOISE_INPUTS}
     limit, read, slope = (arrays[name] for name in RADIANCE)
-    value = sample.values.astype(np.float64)
+    value = float64(sample.values)
     expected = np.maximum(value if reflectance is None else reflectance, 0.0)
     scale = _reflectance_per_radiance(arrays, arrays["light_intensity"])[:, :, None]
     # the longest exposure whose limit is not exceeded
@@ -239,7 +239,7 @@ def sample_variance(
 
 def _reflectance_per_radiance(arrays: Arrays, intensity: Array) -> Array:
     """Distance squared over intensity and fall-off (n, light, channel)."""
-    position = arrays["surfel_position"].astype(np.float64)
+    position = float64(arrays["surfel_position"])
     falloff = arrays["light_falloff"]
     way = position[:, None] - arrays["light_position"]
     square = np.einsum("nlk,nlk->nl", way, way)
@@ -253,7 +253,7 @@ def directions(points: Array, targets: Array) -> Array:
     """(n, t, 3) unit directions from points (n, 3) to targets (t, 3); NaN where both
     coincide.
     """
-    way = targets.astype(np.float64)[None] - points.astype(np.float64)[:, None]
+    way = float64(targets)[None] - float64(points)[:, None]
     length = np.linalg.norm(way, axis=-1, keepdims=True)
     return way / np.where(length > 0, length, np.nan)
 

@@ -11,7 +11,7 @@ from skindb.errors import Fault, InputError
 from skindb.fit.lumitexels import disc_angle, lumitexels, relative_reflectance
 from skindb.parameters import FitParameters
 from skindb.reflectance.dictionary import Dictionary
-from skindb.reflectance.kinds import unfitted_model
+from skindb.reflectance.kinds import SURFACES
 from skindb.reflectance.model import FitRequest, ReflectanceModel
 from skindb.schema import dataset
 from skindb.schema.notes import Omission
@@ -144,7 +144,7 @@ def surface_of(
         parameters.k,
         dictionary,
     )
-    return unfitted_model(parameters.surface, request)
+    return SURFACES[parameters.surface].unfitted(request)
 
 
 def hold_out(

@@ -12,7 +12,7 @@ import xarray as xr
 from skindb.reflectance._lumitexel_kernels import BINS_PER_SCALE
 from skindb.schema import FitStatus, check, dataset, variables
 from skindb.schema.label import FACE
-from skindb.types import AnyArray, Float64, Mask
+from skindb.types import AnyArray, Float64, Mask, float64
 
 HELD_OUT_ERRORS = {
     "light": ("held_out_error", "held_out_error_perceptual"),
@@ -48,7 +48,7 @@ def prediction_table(fitted: xr.Dataset) -> xr.Dataset:
     """
     check(fitted, ("fit_status", "surfel_area"), where="fitted")
     status = fitted["fit_status"].values
-    area = fitted["surfel_area"].values.astype(np.float64)
+    area = float64(fitted["surfel_area"].values)
     errors = [[_values(fitted, name) for name in names] for names in SAMPLES.values()]
     outliers = _values(fitted, "outlier_fraction")
     regions = _regions(fitted)
@@ -312,7 +312,7 @@ def _usual(misfit: xr.DataArray) -> AnyArray:
 def _around(outliers: xr.Dataset, position: AnyArray) -> AnyArray:
     """Usual misfit at each light: the larger of the medians of its neighbours and of all lights."""
     misfit = outliers["light_misfit"].values
-    distance = np.linalg.norm(position[:, None].astype(np.float64) - position, axis=-1)
+    distance = np.linalg.norm(float64(position[:, None]) - position, axis=-1)
     distance[np.arange(len(misfit)), np.arange(len(misfit))] = np.inf
     distance[:, ~np.isfinite(misfit)] = np.inf
     near = np.argsort(distance, axis=1)[:, :NEIGHBOURS]
@@ -411,7 +411,7 @@ def error_of_misfit(fitted: xr.Dataset) -> Float64:
         (surfel, channel), a part of the total error; 0 for usual residuals, NaN where
         nothing was fitted.
     """
-    colour = fitted["diffuse_reflectance"].values.astype(np.float64)
+    colour = float64(fitted["diffuse_reflectance"].values)
     good = fitted["fit_status"].values == FitStatus.FITTED
     if not good.any():
         return np.zeros_like(colour)
@@ -424,4 +424,4 @@ def error_of_misfit(fitted: xr.Dataset) -> Float64:
 def _dictionary_residual(fitted: xr.Dataset) -> Float64:
     """Relative residual of the fit by the dictionary, or else of the fit."""
     name = "dictionary_residual" if "dictionary_residual" in fitted else "fit_residual"
-    return np.asarray(fitted[name].values, np.float64)
+    return float64(fitted[name].values)

@@ -16,7 +16,7 @@ from scipy.special import chdtrc
 
 from skindb.optics.transport import RATIO_MAX, transport_profile
 from skindb.schema import IDENTIFIED, ProbeStatus, check, dataset, label
-from skindb.types import Array
+from skindb.types import Array, float64
 
 # relative errors of transport profiles: at one transport mean free path, which falls like
 # 1/r; at a distance; and of sigma_tr in fits to noise-free random walks
@@ -407,9 +407,7 @@ def fit_probe(probe: xr.Dataset, *, eta: float = 1.3) -> xr.Dataset:
     check(probe, PROBE, where="probe")
     free = not bool(probe["gain_known"])
     radius = float(probe["fibre_radius"])
-    distance, value, error = (
-        probe[name].values.astype(np.float64) for name in PROBE[:3]
-    )
+    distance, value, error = (float64(probe[name].values) for name in PROBE[:3])
     fits = [
         fit_profile(distance, v, e, radius=radius, eta=eta, free_gain=free)
         for site, errors in zip(value, error, strict=True)
@@ -525,15 +523,15 @@ def translucency_map(surfels: xr.Dataset, sites: xr.Dataset) -> xr.Dataset:
     """
     check(surfels, ("surfel_position",), where="surfels")
     check(sites, ("site_sigma_tr", "site_status", "site_position"), where="sites")
-    path = 1 / sites["site_sigma_tr"].values.astype(np.float64)
+    path = 1 / float64(sites["site_sigma_tr"].values)
     good = np.isin(sites["site_status"].values, TRUSTED) & np.isfinite(path)
-    place = sites["site_position"].values.astype(np.float64)
+    place = float64(sites["site_position"].values)
     mirrored = np.abs(place[:, 0]) > MIDLINE
     place = np.concatenate([place, place[mirrored] * [-1, 1, 1]])
     path = np.concatenate([path, path[mirrored]])
     good = np.concatenate([good, good[mirrored]])
     placed = np.isfinite(place).all(1)
-    position = surfels["surfel_position"].values.astype(np.float64)
+    position = float64(surfels["surfel_position"].values)
     weight = np.empty((len(position), len(place)))
     for j in np.flatnonzero(placed):
         weight[:, j] = 1 / (np.square(position - place[j]).sum(1) + SMOOTH**2)

@@ -372,7 +372,7 @@ def corresponding_uv(template: Sheet, chosen: Index, take: Sheet) -> Float64:
     aligned, on_rim, same_outline = _aligned(template, chosen, take, shared)
     face, weight, distance = closest_on_mesh(take.position, take.faces, aligned)
     corners = take.faces[face]
-    uv = np.einsum("nk,nkc->nc", weight, take.uv[corners].astype(np.float64))
+    uv = np.einsum("nk,nkc->nc", weight, float64(take.uv[corners]))
     at_rim = (take.rim[corners] & (weight > 0)).any(axis=1)
     landmarks = cKDTree(template.landmark[shared])
     to_landmark = landmarks.query(template.position[chosen])[0]

@@ -29,7 +29,7 @@ from skindb.ingest.photo_offsets import (
 )
 from skindb.ingest.surfels import SurfelSet
 from skindb.numerics.statistics import correlation
-from skindb.types import Float32, Float64, Half, Index, Mask, dots, finite_rows
+from skindb.types import Float32, Float64, Half, Index, Mask, dots, finite_rows, float64
 
 Pair = tuple[int, int]  # light, camera
 LIGHTS_PER_CAMERA = 3  # those that illuminate the largest part of what the camera sees
@@ -119,7 +119,10 @@ class CalibrationCheck:
     @cached_property
     def seen_area(self) -> Float64:
         """Area (light, camera) [mm2] that is lit and visible, projected to the camera."""
-        area = [self._projected_area(camera) for camera in self.dome.cameras]
+        surfels = self.surfels.area[self.compared]
+        area = [
+            np.maximum(self.cosine(camera), 0) * surfels for camera in self.dome.cameras
+        ]
         return (self.irradiance > 0) @ (np.stack(area, axis=1) * self._clear)
 
     @cached_property
@@ -129,8 +132,8 @@ class CalibrationCheck:
         for j, light in enumerate(self.dome.lights):
             square, falloff = light_falloff(light, self._position)
             way = light.position - self._position
-            cosine = dots(way, self._normal) / np.sqrt(square)
-            visible = self.light_visible[self.compared, j].astype(np.float64)
+            cosine = dots(way, self.surfels.normal[self.compared]) / np.sqrt(square)
+            visible = float64(self.light_visible[self.compared, j])
             lit = np.maximum(cosine, 0) * visible
             rows.append(lit * falloff / square * self.intensity[j].mean())
         return np.array(rows)
@@ -215,10 +218,6 @@ class CalibrationCheck:
         return self.surfels.position[self.compared]
 
     @cached_property
-    def _normal(self) -> Float64:
-        return self.surfels.normal[self.compared]
-
-    @cached_property
     def _clear(self) -> Mask:
         return self.clear[self.compared]
 
@@ -229,11 +228,6 @@ class CalibrationCheck:
     def cosine(self, camera: CameraRecord) -> Float64:
         """Cosine (n,) between the normals of the surfels and the direction to the camera."""
         return self.surfels.cosine(camera, self.compared)
-
-    def _projected_area(self, camera: CameraRecord) -> Float64:
-        """Area (n,) [mm2] of the surfels, projected towards the camera."""
-        area = self.surfels.area[self.compared]
-        return np.maximum(self.cosine(camera), 0) * area
 
     def factor(self, camera: int) -> int:
         """Downsampling factor of a camera."""
@@ -246,7 +240,7 @@ class CalibrationCheck:
 
     def _reduced_pixels(self, camera: int) -> Float64:
         """Pixels (n, 2) of the compared surfels in the downsampled pictures of a camera."""
-        pixels = self.pixels[self.compared, camera].astype(np.float64)
+        pixels = float64(self.pixels[self.compared, camera])
         return pixels / self.factor(camera)
 
     def views(self, pictures: Mapping[Pair, Float32]) -> list[ReducedView]:
@@ -376,7 +370,7 @@ class CalibrationCheck:
                 camera.width,
                 camera.height,
             ):
-                theirs = self.pixels[self.compared, k].astype(np.float64) / factor
+                theirs = float64(self.pixels[self.compared, k]) / factor
                 text = f"they look as if camera {other_camera.id} had taken them"
                 yield text, theirs, self._clear[:, k]
         middle = camera.K[:2, 2] / factor

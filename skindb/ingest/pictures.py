@@ -663,10 +663,6 @@ def _srgb_table(count: int) -> str:
     return "\n".join(["dn,r,g,b", *rows]) + "\n"
 
 
-def _is_file(name: str) -> bool:
-    return Path(name).suffix.lower() in SUFFIXES
-
-
 def _olat_files(
     source: Path, lights: Sequence[str], cameras: Sequence[str]
 ) -> tuple[str, dict[tuple[str, str], Path]]:
@@ -680,7 +676,9 @@ def _olat_files(
     for pattern in PATTERNS:
         files = {}
         for light in lights:
-            name = light.removesuffix(Path(light).suffix) if _is_file(light) else light
+            suffix = Path(light).suffix
+            is_file = suffix.lower() in SUFFIXES
+            name = light.removesuffix(suffix) if is_file else light
             for camera in cameras:
                 stem = _folded(pattern.format(light=name, camera=camera))
                 if file := by_name.get(stem):

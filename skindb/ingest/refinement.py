@@ -20,7 +20,7 @@ from skindb.ingest.consistency import (
     Pair,
 )
 from skindb.ingest.photo_offsets import Offset, ReducedView, bilinear
-from skindb.types import Float32, Float64
+from skindb.types import Float32, Float64, float64
 
 ROUNDS = 2  # a third round shifted the photographs of four captures by at most 0.06 mm
 SMALL_TURN = 1e-4  # rad; step of the finite differences
@@ -195,7 +195,7 @@ def _with_cameras(check: CalibrationCheck, dome: DomeRecord) -> CalibrationCheck
 def _largest_move(before: CalibrationCheck, after: CalibrationCheck) -> float:
     """Largest root mean square displacement [mm] of the face in the pictures of a camera."""
     clear = before.clear[before.compared]
-    moves = (after.pixels - before.pixels)[before.compared].astype(np.float64)
+    moves = float64((after.pixels - before.pixels)[before.compared])
     middle = before.surfels.position.mean(axis=0)
     lengths = [
         camera.pixel_width(middle) * np.sqrt(np.mean(square[seen]))

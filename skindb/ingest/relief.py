@@ -29,6 +29,7 @@ from skindb.types import (
     Mask,
     dots,
     finite_rows,
+    float64,
     lengths,
 )
 
@@ -265,7 +266,7 @@ def photometric_normals(
     enough = np.flatnonzero(shown.sum(axis=0) >= MIN_LIGHTS)
     for i in range(0, len(enough), POINTS_PER_BLOCK):
         at = enough[i : i + POINTS_PER_BLOCK]
-        value, weight = (part[:, at].astype(np.float64) for part in (measured, shown))
+        value, weight = (float64(part[:, at]) for part in (measured, shown))
         normal[at] = _normals_of(value, weight, lights, place[at], view[at])
     return normal.reshape(points.shape)
 

@@ -22,7 +22,7 @@ from skindb.reflectance.model import (
 )
 from skindb.reflectance.tables import Table
 from skindb.schema import variables
-from skindb.types import Array, Float32
+from skindb.types import Array, Float32, float64
 
 MODES = ("linear", "perceptual")  # in the order of `_lumitexel_kernels`
 # that any model has after a first pass, in the order of `SurfaceFit` after its parameters
@@ -65,7 +65,7 @@ def kernel_errors(block: Block, judgement: Judgement) -> JudgedErrors:
     n = len(block.sample)
     diffuse = np.zeros((n, 3))
     if judgement.diffuse_error is not None:
-        diffuse = np.nan_to_num(judgement.diffuse_error.astype(np.float64))
+        diffuse = np.nan_to_num(float64(judgement.diffuse_error))
     turn = np.zeros(n)
     if judgement.normal_error is not None:  # the RMS angle is that of two axes
         angle = np.nan_to_num(np.float64(judgement.normal_error))

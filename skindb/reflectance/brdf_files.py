@@ -158,7 +158,7 @@ def _load(path: Path) -> dict[str, AnyArray]:
                 f"others in {', '.join(wrong)}",
             )
         )
-    return arrays | {name: arrays[name].astype(np.float64) for name in NODES}
+    return arrays | {name: float64(arrays[name]) for name in NODES}
 
 
 def _channel_mean(brdf: AnyArray) -> Array:
@@ -167,7 +167,7 @@ def _channel_mean(brdf: AnyArray) -> Array:
 
     Materials are processed one at a time, as all of them take gigabytes.
     """
-    grey = brdf.astype(np.float64)
+    grey = float64(brdf)
     return grey.mean(axis=-1) if grey.ndim == 4 else grey
 
 

@@ -10,24 +10,13 @@ import xarray as xr
 from skindb.errors import require
 from skindb.reflectance.ggx import GGX
 from skindb.reflectance.mixture import Mixture
-from skindb.reflectance.model import FitRequest, ReflectanceModel, SurfaceKind
+from skindb.reflectance.model import ReflectanceModel, SurfaceKind
 from skindb.reflectance.tables import DEFAULT_GRID, brdf_coords, stored_brdf
 from skindb.schema import check, dataset, variables
 from skindb.types import Array
 
 # by the option `surface` of a fit
 SURFACES: dict[str, SurfaceKind] = {"mixture": Mixture, "ggx": GGX}
-
-
-def unfitted_model(kind: str, request: FitRequest) -> ReflectanceModel:
-    """The surface model of the first pass of a fit, by its name in `SURFACES`.
-
-    Raises
-    ------
-    InputError
-        If the model cannot be fitted as requested.
-    """
-    return SURFACES[kind].unfitted(request)
 
 
 def surface_model(basis: xr.Dataset) -> ReflectanceModel:

@@ -50,7 +50,16 @@ from skindb.reflectance.tables import (
 )
 from skindb.schema import FitStatus, check, dataset, variables
 from skindb.schema.notes import Omission
-from skindb.types import AnyArray, Array, Float32, Float64, Index, Index32, Mask
+from skindb.types import (
+    AnyArray,
+    Array,
+    Float32,
+    Float64,
+    Index,
+    Index32,
+    Mask,
+    float64,
+)
 
 DICTIONARY_VARIABLES = (  # in the order of `SurfaceFit`
     variables.DICTIONARY_WEIGHT,
@@ -91,7 +100,7 @@ class Mixture:
         """Scale and pad the tables."""
         rank = self.table.shape[-1]
         lift = np.eye(rank) if self.lift is None else self.lift
-        largest = np.abs(self.table.reshape(-1, rank)).max(axis=0).astype(np.float64)
+        largest = float64(np.abs(self.table.reshape(-1, rank)).max(axis=0))
         if rank != lift.shape[1]:
             largest[:] = largest.max()
         extreme = np.isfinite(largest) & (largest > 0)

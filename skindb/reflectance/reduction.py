@@ -88,7 +88,7 @@ def reduce_dictionary(
     m = table.shape[-1] - exact
     if rank >= m:
         return table, np.eye(m + exact)
-    cells = table.reshape(-1, m + exact).astype(np.float64)
+    cells = float64(table.reshape(-1, m + exact))
     kept = cells[:, m:]
     cells = cells[:, :m]
     weight = _cell_weight(cells.mean(axis=1), TableGrid(*table.shape[:3]))[:, None]
@@ -238,7 +238,7 @@ def reduce_basis(
     check(fitted, ("dictionary_weight", "fit_status", "surfel_area"), where="fitted")
     good = fitted_surfels(fitted, ("dictionary_weight",))
     weight = fitted["dictionary_weight"].values
-    area = np.maximum(fitted["surfel_area"].values.astype(np.float64), 0) + 1e-12
+    area = np.maximum(float64(fitted["surfel_area"].values), 0) + 1e-12
     limit = min(len(good), weight.shape[1])
     require(
         1 <= k <= limit,
@@ -251,7 +251,7 @@ def reduce_basis(
     chosen = good[np.sort(rng.choice(len(good), count, replace=False))]
     # of coefficients, the choice of the paper: errors between BRDFs (`brdf_metric`) gave
     # larger residuals with k = 2, smaller ones from k = 6, and either with k = 4
-    factors = nmf(weight[chosen].astype(np.float64), k, seeds=SEEDS, rng=rng)
+    factors = nmf(float64(weight[chosen]), k, seeds=SEEDS, rng=rng)
     tables = dictionary.table @ factors.H.T.astype(np.float32)
     names = [f"component{i}" for i in range(k)]
     return dataset(
@@ -279,7 +279,7 @@ def _mean_weight(weight: Array, area: Array, good: Index) -> Array:
     """Mean (m,) of the weights (n, m) of some surfels, weighted by area (n,)."""
     # in parts: a million surfels in double precision would take half a gigabyte
     parts = (good[i : i + PART] for i in range(0, len(good), PART))
-    sums = [area[part] @ weight[part].astype(np.float64) for part in parts]
+    sums = [area[part] @ float64(weight[part]) for part in parts]
     return np.sum(sums, axis=0) / area[good].sum()
 
 
@@ -328,14 +328,12 @@ class Systems(NamedTuple):
         gram = np.zeros((n, m, m))
         rhs = np.zeros((n, m))
         for s, (start, stop) in enumerate(pairwise(offsets)):
-            block = rows[start:stop].astype(np.float64)
+            block = float64(rows[start:stop])
             gram[s] = target.shape[1] * (block.T @ block)
             rhs[s] = block.T @ target[start:stop].sum(axis=1)
         surfel = np.repeat(np.arange(n), np.diff(offsets))
         square = float64(np.bincount(surfel, (target**2).sum(axis=1), n))
-        return cls(
-            gram, rhs, square, np.diff(offsets).astype(np.float64) * target.shape[1]
-        )
+        return cls(gram, rhs, square, float64(np.diff(offsets)) * target.shape[1])
 
     def within(self, H: Array) -> Systems:
         """Normal equations for the weights of k mixtures H (k, m)."""

@@ -18,7 +18,7 @@ from skindb.reflectance.block import kernel_block
 from skindb.reflectance.dictionary import abc_parameters, evaluate_abc
 from skindb.reflectance.model import Block
 from skindb.reflectance.tables import DEFAULT_GRID, TableGrid, tabulate
-from skindb.types import Array, Float32, Float64
+from skindb.types import Array, Float32, Float64, float64
 
 # The six most different embedded materials, from narrow to nearly diffuse. The width of
 # the broadest one trades two errors: broad lobes take light from R_d, and without them
@@ -84,7 +84,7 @@ def _lobe_table() -> Float32:
     by theta_h [rad], two zeros.
     """
     table, grid = surface_lobes()
-    steep = np.gradient(table.astype(np.float64), grid.theta_h, axis=0)
+    steep = np.gradient(float64(table), grid.theta_h, axis=0)
     gap = np.zeros((*table.shape[:3], 2))
     joined = np.ascontiguousarray(
         np.concatenate([table, gap, steep, gap], axis=-1), np.float32

@@ -125,7 +125,7 @@ def brdf_metric(tables: AnyArray, *, weighted_like: AnyArray | None = None) -> A
         # dwi dwo = 4 cos(theta_d) dwh dwd (Rusinkiewicz 1998); nodes are uniform in sqrt(theta_h)
         measure = np.sin(theta_h) * np.sqrt(theta_h) * np.sin(theta_d) * np.cos(theta_d)
         measure = measure * np.maximum(wi[..., 2], 0.0) * np.maximum(wo[..., 2], 0.0)
-        cells = slab.reshape(-1, tables.shape[-1]).astype(np.float64)
+        cells = float64(slab.reshape(-1, tables.shape[-1]))
         weight = measure.ravel() / np.maximum(mean.ravel(), 1e-6) ** (4 / 3)
         gram += cells.T @ (cells * weight[:, None])
     return gram

@@ -13,11 +13,11 @@ import re
 import uuid
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from functools import partial
 from typing import Any, get_origin, get_type_hints
 
 from skindb import __version__
+from skindb.clock import utc_time
 from skindb.errors import Fault, InputError, UnavailableError, attempt, input_error
 from skindb.store.markers import is_sealed, keyed_hash, keyed_seal, require_secret
 from skindb.store.place import AUDIT, Place, in_parallel, subject_of
@@ -90,7 +90,7 @@ def append_entry(
     fields = {
         "format": FORMAT,
         "id": uuid.uuid4().hex,
-        "when": datetime.now(UTC).isoformat(timespec="seconds"),
+        "when": utc_time(),
         "actor": actor,
         "action": action,
         "subjects": sorted(keyed_hash(secret, name) for name in names),

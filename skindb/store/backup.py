@@ -11,11 +11,11 @@ database again.
 import hashlib
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from functools import partial
 from typing import TypeVar
 
 from skindb import __version__
+from skindb.clock import utc_time
 from skindb.errors import Fault, InputError, input_error
 from skindb.schema.consent import CONSENT
 from skindb.store.archive import (
@@ -225,7 +225,7 @@ def _write_state(place: Place, archive: Archive, lease: Lease) -> BackupReport:
         archive.put(content, digest, guard)
     state = State(
         number=max(archive.numbers(), default=0) + 1,
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        created=utc_time(),
         software_version=__version__,
         versions=len(draft.records),
         withdrawals=seal_of_withdrawals(markers),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -31,7 +31,7 @@ from skindb.store.gathered import (
     table_sources,
 )
 from skindb.store.place import SUMMARY, Located
-from skindb.store.record import Record
+from skindb.store.record import Record, intact_or_none
 from skindb.store.snapshot import Lookup
 
 # takes that are read faster by themselves than from caches that hold many others
@@ -156,15 +156,12 @@ def _stored_records(
     lookup: Lookup, records: Mapping[str, Record], request: CohortRequest
 ) -> dict[str, Record]:
     """The versions with the data of each take; an `InputError` names takes without them."""
-    stored = {}
-    missing = []
-    for take, record in records.items():
-        version = _stored_record(lookup, record, request)
-        if version is None:
-            missing.append(take)
-        else:
-            stored[take] = version
-    if missing:
+    stored = {
+        take: version
+        for take, record in records.items()
+        if (version := _stored_record(lookup, record, request))
+    }
+    if missing := [take for take in records if take not in stored]:
         kind = records[missing[0]].kind
         data = {
             "maps": f"maps of {request.size} texels",
@@ -323,20 +320,17 @@ def _stored_record(
         request = replace(
             request, variables=tuple(name for name in names if name in stored)
         )
+    # preferred, because they are newer than the data of the version
     for summary in reversed(lookup.history(SUMMARY, record.take)):
-        sources = [(i["kind"], i["generation"], i["seal"]) for i in summary.made_from]
-        if (record.kind, record.generation, record.seal) in sources and _has_data_for(
-            summary, request
-        ):
-            return (
-                summary  # preferred, because it is newer than the data of the version
-            )
+        seals = [reference["seal"] for reference in summary.made_from]
+        if record.seal in seals and _has_data_for(summary, request):
+            return summary
     return record if _has_data_for(record, request) else None
 
 
 def _has_data_for(record: Record, request: CohortRequest) -> bool:
-    by = record.provenance.get("summary_parameters", {}).get("digest", "")
-    if request.digest and by != request.digest:
+    parameters = record.provenance.get("summary_parameters", {})
+    if request.digest and parameters.get("digest", "") != request.digest:
         return False
     contents = record.contents.get(GROUP[request.layout])
     if contents is None:  # the take of a summary without a sample has no fitted surfels
@@ -347,7 +341,6 @@ def _has_data_for(record: Record, request: CohortRequest) -> bool:
         )
     if request.layout == "surfels":
         count = int(contents["sizes"]["surfel"])
-        parameters = record.provenance.get("summary_parameters", {})
         # fewer than requested: the sample contains all fitted surfels
         is_complete = count < int(parameters.get("surfels", 0))
         return count >= request.surfels or is_complete
@@ -410,15 +403,11 @@ def _layout(contents: Contents, dome: Contents) -> Layouts:
 
 def _capture_of(lookup: Lookup, model: Record) -> Record | None:
     """The capture with samples from which a model was made; None if there is none."""
-    for reference in model.made_from:
-        if reference["kind"] == "capture":
-            try:
-                capture = lookup.generation(
-                    "capture", reference["take"], reference["generation"]
-                )
-            except InputError:
-                return None
-            return capture if {"dome", "samples"} <= capture.contents.keys() else None
+    for key in model.input_keys:
+        if key[0] == "capture":
+            capture = intact_or_none(partial(lookup.generation, *key))
+            has_samples = capture and {"dome", "samples"} <= capture.contents.keys()
+            return capture if has_samples else None
     return None
 
 

@@ -122,7 +122,9 @@ class _Evaluation:
             ) if elts:
                 links = [self.compared(ast.Eq, values, self.values(x)) for x in elts]
                 truth = _combined(links, decisive=True)
-            case ast.In() | ast.NotIn(), ast.Name() if self.is_text(right):
+            case ast.In() | ast.NotIn(), ast.Name() if _kinds(self.values(right)) <= {
+                TEXT
+            }:
                 truth = self.compared(ast.In, values, self.values(right))
             case ast.Is() | ast.IsNot() | ast.In() | ast.NotIn(), _:
                 rule = "must use 'is' as in 'age is missing', and 'in' before values or a text"
@@ -137,10 +139,6 @@ class _Evaluation:
             return self.columns[self.column(node.id)]
         rows = len(next(iter(self.columns.values())))
         return [self.literal(node)] * rows
-
-    def is_text(self, node: ast.expr) -> bool:
-        """Whether a column or a literal has only text."""
-        return _kinds(self.values(node)) <= {TEXT}
 
     def column(self, name: str) -> str:
         """The column with this name."""

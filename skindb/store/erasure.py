@@ -137,7 +137,7 @@ def holdings_of(place: Place, markers: Markers) -> Holdings:
         ),
         scratch=tuple(
             path
-            for path in _scratch(place)
+            for path in sorted(place.scratch().glob("*"))
             if (match := SCRATCH_NAME.fullmatch(path.name))
             and markers.is_withdrawn(subject_of(match[1]))
         ),
@@ -211,6 +211,7 @@ def erase(place: Place, subject: str, *, wait: float = 0.0) -> Erasure:
                 if kind != CONSENT and subject_of(take) == subject
             }
         )
+        with_space = partial(_with_space, place, holdings)
         with ExitStack() as leases:
             for take in takes:
                 lease = Lease(
@@ -220,12 +221,8 @@ def erase(place: Place, subject: str, *, wait: float = 0.0) -> Erasure:
                     wait=wait,
                     command="skindb withdraw",
                 )
-                _with_space(place, holdings, partial(leases.enter_context, lease))
-            _with_space(
-                place,
-                holdings,
-                partial(mark_withdrawn, place, subject, holdings.counts),
-            )
+                with_space(partial(leases.enter_context, lease))
+            with_space(partial(mark_withdrawn, place, subject, holdings.counts))
         note_withdrawals(place, is_repeated=True)
     return erase_withdrawn(place)
 
@@ -257,19 +254,29 @@ def _erase_holdings(
     for folder in holdings.scratch:
         remove_tree(folder)
     for (kind, take), number in holdings.takes.items():
-        _erase_take(place, kind, take)
+        # No tombstones remain, because no other version refers to these versions any more.
+        # The records last, so that the same call completes a removal that was interrupted.
+        for key in (
+            f"data/{kind}/{take}",
+            f"leases/{kind}/{take}",
+            f"heads/{kind}/{take}.json",
+            f"log/{kind}/{take}",
+        ):
+            place.remove(key)
         erasure.removed += Counter({kind: number})
+    with_space = partial(_with_space, place, holdings)
     for request in holdings.requests:
-        _replace_request(place, holdings, request, markers)
+        changed = request.without(markers.is_withdrawn)
+        if changed is None:
+            place.remove(request.key)
+        else:
+            with_space(partial(write_request, place, changed))
+    prepare = partial(_before_removal, place, holdings, markers, erasure)
     for record in holdings.versions:
         if _key(record) in holdings.current:
-            _with_space(
-                place,
-                holdings,
-                partial(_before_removal, place, record, holdings, markers, erasure),
-            )
+            with_space(partial(prepare, record))
     for record in holdings.versions:
-        _with_space(place, holdings, partial(_remove_record, place, record))
+        with_space(partial(_remove_record, place, record))
         erasure.removed[record.kind] += 1
     for key in (*holdings.damaged, *holdings.caches):
         place.remove(key)
@@ -301,22 +308,6 @@ def subject_holdings(place: Place, subject: str) -> Holdings:
     if holdings == replace(present, caches=holdings.caches):
         require_subject(place, subject)
     return holdings
-
-
-def _erase_take(place: Place, kind: str, take: str) -> None:
-    """Remove all files of a kind of a take: versions, records including damaged ones,
-    and files of killed runs.
-
-    No tombstones remain, because no other version refers to these versions any more.
-    """
-    # the records last, so that the same call completes a removal that was interrupted
-    for key in (
-        f"data/{kind}/{take}",
-        f"leases/{kind}/{take}",
-        f"heads/{kind}/{take}.json",
-        f"log/{kind}/{take}",
-    ):
-        place.remove(key)
 
 
 def _remove_record(place: Place, record: Record) -> None:
@@ -357,15 +348,12 @@ def _doomed(records: Iterable[Record], markers: Markers) -> list[Record]:
     ]
     gone = {_key(record) for record in doomed}
     # a release holds no data: it only names versions, and those that remain do it no harm
-    releases = [
-        record
-        for record in listed
-        if record.kind == RELEASE and _key(record) not in refused
-    ]
     doomed += [
         record
-        for record in releases
-        if any(_input_key(reference) in gone for reference in record.made_from)
+        for record in listed
+        if record.kind == RELEASE
+        and _key(record) not in refused
+        and any(_input_key(reference) in gone for reference in record.made_from)
     ]
     return sorted(
         doomed, key=lambda record: (_rank(record.kind), record.take, record.generation)
@@ -445,25 +433,8 @@ def _is_admitted(place: Place, markers: Markers, path: str, subjects: set[str]) 
     return not any(map(markers.is_withdrawn, subjects.union(map(subject_of, names))))
 
 
-def _scratch(place: Place) -> list[Path]:
-    """Scratch folders on this machine."""
-    folder = place.scratch()
-    return sorted(folder.iterdir()) if folder.is_dir() else []
-
-
-def _replace_request(
-    place: Place, holdings: Holdings, request: Request, markers: Markers
-) -> None:
-    """Take withdrawn subjects out of a request."""
-    changed = request.without(markers.is_withdrawn)
-    if changed is None:
-        place.remove(request.key)
-    else:
-        _with_space(place, holdings, partial(write_request, place, changed))
-
-
 def _before_removal(
-    place: Place, record: Record, holdings: Holdings, markers: Markers, erasure: Erasure
+    place: Place, holdings: Holdings, markers: Markers, erasure: Erasure, record: Record
 ) -> None:
     """Prepare the replacement of the newest version of a kind and take that is to be removed."""
     gone = {_key(version) for version in holdings.versions}

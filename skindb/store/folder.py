@@ -308,10 +308,6 @@ class Folder:
                 return
 
 
-def _identity(status: os.stat_result) -> tuple[int, ...]:
-    return status.st_size, status.st_mtime_ns, status.st_ino
-
-
 def _walk(
     place: str | Path, prefix: str = "", depth: int = MAX_FOLDER_DEPTH
 ) -> dict[str, tuple[int, ...]]:
@@ -329,7 +325,9 @@ def _walk(
             continue
         with suppress(FileNotFoundError):
             status = entry.stat(follow_symlinks=False)
-            files[name] = _identity(status) if stat.S_ISREG(status.st_mode) else (-1,)
+            files[name] = (-1,)
+            if stat.S_ISREG(status.st_mode):
+                files[name] = status.st_size, status.st_mtime_ns, status.st_ino
     return files
 
 

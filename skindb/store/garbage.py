@@ -158,8 +158,8 @@ def _unrecorded(place: Place, kind: str, take: str, now: Clock) -> Iterator[Garb
             reason = ""  # its writer can no longer commit
         else:
             files = [f"{key}/{name}" for name in names if stem in name]
-            in_use = _in_use_reason(place, kind, take)
-            reason = in_use or _recent_reason(place, files, now)
+            reason = _in_use_reason(place, kind, take)
+            reason = reason or _recent_reason(place, files, now)
         what = "a version without a record, left by a killed run"
         yield Garbage(f"{key}/{stem}.zarr", what, size, reason)
 
@@ -263,7 +263,7 @@ def _old_generations(place: Place, generations: int, now: Clock) -> Iterator[Gar
     for (kind, take, generation), record in listed.items():
         if (kind, take, generation) not in stays:
             what = f"generation {generation}, which is not an input of a kept version"
-            in_use = _in_use_reason(place, kind, take)
-            reason = in_use or _recent_reason(place, [record.path], now)
+            reason = _in_use_reason(place, kind, take)
+            reason = reason or _recent_reason(place, [record.path], now)
             key = Log(place, kind, take).record_key(generation)
             yield Garbage(key, what, record.bytes, reason, generation)

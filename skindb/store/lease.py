@@ -19,11 +19,10 @@ import time
 import uuid
 from contextlib import suppress
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Self
 
-from skindb.clock import SYSTEM_CLOCK, Clock
+from skindb.clock import SYSTEM_CLOCK, Clock, utc_time
 from skindb.errors import Fault, InputError, input_error
 from skindb.files import Attributes, Json
 from skindb.store.markers import WithdrawalGuard, WithdrawnError
@@ -230,8 +229,8 @@ class Lease:
             "token": self.token,
             "holder": this_process() | {"command": self.command},
             "seconds": self.seconds,
+            "since": utc_time(),
         }
-        body["since"] = datetime.now(UTC).isoformat(timespec="seconds")
         self._content = json.dumps(body).encode()
         for key in self.keys:  # sorted, so that two runs never wait for each other
             holder = self._claim(key)
@@ -245,17 +244,16 @@ class Lease:
         if before is not None and not _has_ended(self.place, before):
             return before
         number = 1 + (before.number if before else 0)
+        file = _file_key(key, number)
         try:
-            created = self.place.create(
-                _file_key(key, number), self._content, guard=self._guard
-            )
+            created = self.place.create(file, self._content, guard=self._guard)
         except WithdrawnError:
-            self.place.remove(_file_key(key, number))
+            self.place.remove(file)
             raise
         now = _newest(self.place, key)
         if now is None or now.body.get("token") != self.token:
             if created:  # others have created higher numbers meanwhile
-                self.place.remove(_file_key(key, number))
+                self.place.remove(file)
             return now or Claim(key, number, {})
         self._held[key] = number
         for older in _numbers(self.place, key):
@@ -265,9 +263,7 @@ class Lease:
 
     def _release(self) -> None:
         """Mark the leases as free, without the holder; their numbers are not reused."""
-        content = json.dumps(
-            {"released": datetime.now(UTC).isoformat(timespec="seconds")}
-        ).encode()
+        content = json.dumps({"released": utc_time()}).encode()
         with suppress(OSError, InputError):  # otherwise the lease expires
             for key, number in self._held.items():
                 newest = _newest(self.place, key)

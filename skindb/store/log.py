@@ -12,10 +12,11 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import replace
-from datetime import UTC, datetime
 from functools import partial
 
+from skindb.clock import utc_time
 from skindb.errors import Fault, InputError, attempt, input_error
 from skindb.files import Json
 from skindb.store.markers import WithdrawnError
@@ -132,7 +133,10 @@ class Log:
                     "run the command again",
                 )
             )
-        self._write_head(record.generation, seal, guard)
+        # the record is committed, even if the cache cannot be written
+        with suppress(OSError, InputError):
+            head = self.head_content(record.generation, seal)
+            self.place.replace(self.head_key, head, guard=guard)
         return replace(record, seal=seal)
 
     def remove(self, generation: int) -> None:
@@ -247,14 +251,6 @@ class Log:
         cure = f"{RESTORE}; if the log is correct, remove {self.head_key}"
         return [Fault(self.what, rule, finding, cure)]
 
-    def _write_head(self, generation: int, seal: str, guard: Guard = unguarded) -> None:
-        try:
-            self.place.replace(
-                self.head_key, self.head_content(generation, seal), guard=guard
-            )
-        except (OSError, InputError):
-            return  # the record is committed, even if the cache cannot be written
-
     def head_content(self, generation: int, seal: str) -> bytes:
         """Content of the head that names a record."""
         head = {"generation": generation, "seal": seal}
@@ -315,7 +311,7 @@ def tombstone_of(seal: str) -> str:
 def tombstone_content(record: Record) -> bytes:
     """Content of the tombstone of a record that is removed now."""
     tombstone = {"format": FORMAT, "seal": record.seal, "previous": record.previous}
-    tombstone["removed"] = datetime.now(UTC).isoformat(timespec="seconds")
+    tombstone["removed"] = utc_time()
     return json.dumps(tombstone).encode()
 
 

@@ -39,10 +39,10 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
+from skindb.clock import utc_time
 from skindb.errors import (
     Fault,
     InputError,
@@ -176,8 +176,7 @@ def mark_withdrawn(place: Place, subject: str, removed: Mapping[str, int]) -> No
     """
     secret = require_secret(place)
     key = f"{WITHDRAWN}/{keyed_hash(secret, subject)}.json"
-    now = datetime.now(UTC).isoformat(timespec="seconds")
-    body = {"withdrawn": now, "removed": dict(removed)}
+    body = {"withdrawn": utc_time(), "removed": dict(removed)}
     content = json.dumps({**body, "seal": keyed_seal(secret, key, body)})
     place.create(key, content.encode())
 

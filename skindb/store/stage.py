@@ -311,9 +311,8 @@ class Stage:
         remove_version(self.place, self.path)
         kind = self.log.kind
         take = self.log.take
-        subjects = subjects_of(kind, take, ())
         markers = read_markers(self.place)
-        if any(markers.is_withdrawn(subject) for subject in subjects):
+        if any(map(markers.is_withdrawn, subjects_of(kind, take, ()))):
             self.place.remove(f"data/{kind}/{take}")
 
     def _create_beside(self, record: Record, suffix: str, value: Any) -> str:

@@ -72,20 +72,14 @@ def manifest_from_json(content: bytes) -> Manifest:
 def read_beside(place: Place, record: Record, suffix: str, digest: str) -> bytes:
     """Contents of a file beside a version, compared with its digest in the record."""
     key = record.beside(suffix)
+    location = place.where(key)
     try:
         text = place.read_small(key)
     except OSError as error:
-        fault = Fault(
-            place.where(key), AS_COMMITTED, error.strerror or "an unreadable file", CURE
-        )
-        raise InputError(fault) from None
-    require(
-        hashlib.sha256(text).hexdigest() == digest,
-        place.where(key),
-        AS_COMMITTED,
-        CHANGED,
-        CURE,
-    )
+        finding = error.strerror or "an unreadable file"
+        raise input_error(location, AS_COMMITTED, finding, CURE) from None
+    is_committed = hashlib.sha256(text).hexdigest() == digest
+    require(is_committed, location, AS_COMMITTED, CHANGED, CURE)
     return text
 
 

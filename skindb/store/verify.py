@@ -186,7 +186,10 @@ def _unrecorded_faults(
     for key in beside:
         _, kind, take, _ = key.split("/")
         is_known = key in named or f"{kind} of {take}" in damaged
-        if not is_known and _has_lost_record(place, kind, take):
+        log = Log(place, kind, take)
+        # it never had a record if the head names the newest record and the log has it, and
+        # may never have had one if there are none, or if the last run under a lease was killed
+        if not is_known and log.generations() and may_have_had_record(log):
             faults.append(
                 Fault(
                     place.where(key),
@@ -197,17 +200,6 @@ def _unrecorded_faults(
                 )
             )
     return faults
-
-
-def _has_lost_record(place: Place, kind: str, take: str) -> bool:
-    """Whether a version that was written completely must have lost its record.
-
-    The version never had a record if the head names the newest record and the log has
-    it. It may never have had one if there are no records at all, or if the last run
-    under a lease was killed.
-    """
-    log = Log(place, kind, take)
-    return bool(log.generations()) and may_have_had_record(log)
 
 
 def may_have_had_record(log: Log) -> bool:

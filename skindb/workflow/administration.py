@@ -9,13 +9,13 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import skindb
 from skindb import __version__, store
+from skindb.clock import utc_time
 from skindb.errors import Fault, InputError, few_names
 from skindb.files import private_file
 from skindb.store import (
@@ -314,7 +314,7 @@ def withdraw(
         revised=tuple(erasure.revised),
         lost=tuple(erasure.lost),
         backups=erased,
-        date=datetime.now(UTC).isoformat(timespec="seconds"),
+        date=utc_time(),
     )
 
 

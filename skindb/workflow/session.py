@@ -6,11 +6,10 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from skindb.clock import SYSTEM_CLOCK, Clock, SimulatedClock
+from skindb.clock import SYSTEM_CLOCK, Clock, SimulatedClock, utc_time
 from skindb.errors import Fault, InputError, input_error
 from skindb.files import Json, make_private, private_umask
 from skindb.format.fields import IDENTIFIER, read_json
@@ -257,7 +256,7 @@ def _subject_faults(parameters: SessionParameters) -> list[Fault]:
         faults.append(Fault("--consent", rule, str(parameters.consent), cure))
     subject = Subject(
         parameters.subject or "S",
-        _now(),
+        utc_time(),
         {"scope": [NECESSARY_SCOPE], "reference": parameters.reference or "-"},
         parameters.condition,
         traits,
@@ -291,10 +290,6 @@ def _names(text: str) -> list[str]:
     return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
 
 
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")
-
-
 def _setup(parameters: SessionParameters, laboratory: Laboratory | None) -> Setup:
     folder = parameters.setup if laboratory is None else laboratory.subject
     assert folder is not None  # a capture needs it
@@ -326,7 +321,7 @@ def _override(parameters: SessionParameters) -> Override | Rehearsal | None:
     """Confirmation of the operator, or that it is a rehearsal, in which nobody is present."""
     override = None
     if parameters.confirm_screening:
-        override = Override(str(parameters.operator), _now())
+        override = Override(str(parameters.operator), utc_time())
     return Rehearsal(override) if parameters.virtual else override
 
 
@@ -344,7 +339,7 @@ def _subject(parameters: SessionParameters, laboratory: Laboratory | None) -> Su
         consent["reference"] = parameters.reference
     return Subject(
         parameters.subject or record["subject"],
-        _now(),
+        utc_time(),
         consent,
         parameters.condition,
         {**record["traits"], **_traits(parameters.traits)},

@@ -13,7 +13,7 @@ from skindb.errors import InputError
 from skindb.parameters import FitParameters
 from skindb.reflectance.block import empty_fit
 from skindb.reflectance.ggx import GGX
-from skindb.reflectance.kinds import SURFACES, surface_model, unfitted_model
+from skindb.reflectance.kinds import SURFACES, surface_model
 from skindb.reflectance.lobes import evaluate_lobe
 from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.model import (
@@ -374,9 +374,9 @@ def test_kinds__are_the_choices_of_fits():
 
 
 def test_kinds__stored_and_unfitted_models():
-    model = unfitted_model("ggx", FitRequest(1.4, 0.01, 16, 4))
+    model = SURFACES["ggx"].unfitted(FitRequest(1.4, 0.01, 16, 4))
     assert model == GGX(1.4, 0.01)
     stored = dataset({"lobe_index": 1.4, "disc_angular_radius": 0.01})
     assert surface_model(stored) == model
     with pytest.raises(InputError, match="mixtures alone are of a dictionary"):
-        unfitted_model("ggx", FitRequest(1.4, 0.01, 16, 4, object()))
+        SURFACES["ggx"].unfitted(FitRequest(1.4, 0.01, 16, 4, object()))

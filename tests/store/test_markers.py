@@ -15,6 +15,7 @@ from functools import partial
 import pytest
 from stored import commit
 
+from skindb import clock
 from skindb.errors import InputError
 from skindb.store import Database, MarkerFileWarning, markers
 from skindb.store.folder import Folder
@@ -41,7 +42,7 @@ class _Clock(datetime):
 @pytest.fixture
 def place(tmp_path, monkeypatch):
     """A folder whose subject S01 was withdrawn on 10 March."""
-    monkeypatch.setattr(markers, "datetime", _Clock)
+    monkeypatch.setattr(clock, "datetime", _Clock)
     found = Folder(tmp_path / "db")
     mark_withdrawn(found, "S01", {"model": 2})
     return found
