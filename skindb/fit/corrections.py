@@ -17,7 +17,7 @@ from skindb.fit.lumitexels import POLARISATION, cosines, directions
 from skindb.geometry.interreflection import bounce_transfer, tangent_frames
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.schema import check, dataset
-from skindb.types import AnyArray, Array, Float32, Index, float64
+from skindb.types import AnyArray, Array, Float32, Index, finite_rows, float64, lengths
 
 # surfels in a camera that are used: twice as many changed gains by 0.1 to 0.4 %, at
 # most 2.2 %
@@ -187,7 +187,7 @@ def light_residuals(
     """
     light = float64(lumitexels["light_position"].values)
     away = light - lumitexels["surfel_position"].values.mean(axis=0, dtype=np.float64)
-    distance = np.linalg.norm(away, axis=1)[:, None]
+    distance = lengths(away)[:, None]
     axes = (tangent_frames(away / distance)[:, :2] * distance[:, None]).swapaxes(0, 1)
     moved = [light, *(light + TURN * axis for axis in axes)]
     form = _residual_form(lumitexels, moved, rng=rng, eta=eta)
@@ -226,7 +226,7 @@ def estimate_camera_gains(
         leaves = fresnel_transmittance(view.cosine, eta)
         if (level > 0).all():
             logs[view.surfel, view.camera] = np.log(level / leaves)
-    logs[np.isfinite(logs).all(axis=2).sum(axis=1) < 2] = np.nan
+    logs[finite_rows(logs).sum(axis=1) < 2] = np.nan
     gains = np.full(shape[1:], np.nan)
     shared = np.isfinite(logs).any(axis=(0, 2))
     if shared.any() and not all(name in lumitexels for name in POLARISATION):
@@ -354,7 +354,7 @@ class _View(NamedTuple):
 
 def _views(few: xr.Dataset, lights: Sequence[Array], *, eta: float) -> Iterator[_View]:
     """Views of enough lights."""
-    finite = np.isfinite(few["reflectance_sample"].values).all(axis=3)
+    finite = finite_rows(few["reflectance_sample"].values)
     position, normal, camera = (
         float64(few[name].values) for name in (*NEEDED[:2], NEEDED[3])
     )

@@ -25,6 +25,7 @@ from skindb.parameters import (
 from skindb.reflectance._separation_kernels import MAX_GLOSS_CROSSED
 from skindb.schema import FitStatus, dataset, variables
 from skindb.schema.declaration import LARGEST_R_D, SMALLEST_R_D
+from skindb.types import lengths
 
 # Quantile of R_d in blue over the surfels, which bounds even reflection: moles and brows
 # reflect little else. The darkest hundredth may be wrong by noise and shadows.
@@ -76,7 +77,7 @@ def crossed_gloss(lumitexels: xr.Dataset, eta: float) -> float | None:
         directions(middle, lumitexels[f"{device}_position"].values)[0]
         for device in ("light", "camera")
     )
-    cosine = np.linalg.norm(lights[:, None] + cameras, axis=-1) / 2  # of theta_d
+    cosine = lengths(lights[:, None] + cameras) / 2  # of theta_d
     both = np.outer(*(lumitexels[name].values for name in POLARISATION))
     gloss = 1 - both * circular_reversal(cosine, eta)
     crossed = gloss[gloss <= MAX_GLOSS_CROSSED]

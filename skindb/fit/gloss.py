@@ -42,7 +42,7 @@ from skindb.reflectance.model import MIN_LOBE_WIDTH, Comparison
 from skindb.schema import dataset, variables
 from skindb.schema.declaration import MIN_SAMPLES_TRUSTED
 from skindb.schema.label import FACE
-from skindb.types import Array, IntVector, Mask
+from skindb.types import Array, IntVector, Mask, finite_rows, lengths
 
 # Strength of the lobe over the median R_d. The first was chosen on four faces of Extended
 # Yale B; of five up to it, it is also the best for the four others and, at this width, for
@@ -190,7 +190,7 @@ def _samples(lumitexels: xr.Dataset, surfels: int) -> xr.Dataset:
 
 def _sample_count(part: xr.Dataset) -> Array:
     """Number of samples (surfel,)."""
-    finite = np.isfinite(part["reflectance_sample"].values).all(axis=3)
+    finite = finite_rows(part["reflectance_sample"].values)
     return finite.sum(axis=(1, 2))
 
 
@@ -253,7 +253,7 @@ def _errors(
     value = np.einsum("nlcj,nj->nlc", evaluate_graded(wi, wo), refined.strength)
     if all(name in part for name in POLARISATION):
         both = np.outer(*(part[name].values for name in POLARISATION))
-        apart = np.linalg.norm(wi + wo, axis=-1) / 2  # cosine of theta_d
+        apart = lengths(wi + wo) / 2  # cosine of theta_d
         value *= 1 - both * circular_reversal(apart, eta)
     value += passed[0] * passed[1] * refined.diffuse.mean(axis=1)[:, None, None] / np.pi
     predicted = np.where(steep, wi[..., 2] * value, np.nan)

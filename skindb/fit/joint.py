@@ -33,7 +33,7 @@ from skindb.reflectance.joint import (
 from skindb.reflectance.model import MIN_LOBE_WIDTH, Comparison
 from skindb.schema import check, variables
 from skindb.schema.declaration import LARGEST_R_D, SMALLEST_R_D
-from skindb.types import Array
+from skindb.types import Array, dots
 
 # Factors of the errors by device and by samples, and an angle [degree], of which the total
 # error of a normal consists. Chosen on six captures with known truth, where 93 to 99 % of
@@ -165,7 +165,7 @@ def _total_angle(refined: JointFit, sequential: Array) -> Array:
     """Total error (n,) of the normals [degree], which the errors of the samples alone do
     not explain: lobes of other shapes and partly hidden lights turn normals too.
     """
-    cosine = np.einsum("nk,nk->n", refined.normal, sequential)
+    cosine = dots(refined.normal, sequential)
     change = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     shared = np.degrees(refined.normal_shared)
     noise = np.degrees(refined.normal_error)

@@ -14,7 +14,7 @@ from skindb.errors import Fault, InputError
 from skindb.parameters import SCAN_ERROR_DEGREES
 from skindb.reflectance.model import UNKNOWN_NOISE, Block, Noise
 from skindb.schema import check, variables
-from skindb.types import AnyArray, Array, float64
+from skindb.types import AnyArray, Array, float64, lengths
 
 Arrays = Mapping[str, AnyArray]  # of a block of surfels, by variable
 GEOMETRY = (
@@ -109,7 +109,7 @@ def disc_angle(lumitexels: xr.Dataset) -> float:
     0 for point lights.
     """
     middle = float64(lumitexels["surfel_position"].values).mean(axis=0)
-    distance = np.linalg.norm(lumitexels["light_position"].values - middle, axis=1)
+    distance = lengths(lumitexels["light_position"].values - middle)
     radius = lumitexels["light_disc_radius"].values
     return float(np.median(np.arctan2(radius, distance)))
 

@@ -12,7 +12,7 @@ import xarray as xr
 from skindb.reflectance._lumitexel_kernels import BINS_PER_SCALE
 from skindb.schema import FitStatus, check, dataset, variables
 from skindb.schema.label import FACE
-from skindb.types import AnyArray, Float64, Mask, float64
+from skindb.types import AnyArray, Float64, Mask, float64, lengths
 
 HELD_OUT_ERRORS = {
     "light": ("held_out_error", "held_out_error_perceptual"),
@@ -312,7 +312,7 @@ def _usual(misfit: xr.DataArray) -> AnyArray:
 def _around(outliers: xr.Dataset, position: AnyArray) -> AnyArray:
     """Usual misfit at each light: the larger of the medians of its neighbours and of all lights."""
     misfit = outliers["light_misfit"].values
-    distance = np.linalg.norm(float64(position[:, None]) - position, axis=-1)
+    distance = lengths(float64(position[:, None]) - position)
     distance[np.arange(len(misfit)), np.arange(len(misfit))] = np.inf
     distance[:, ~np.isfinite(misfit)] = np.inf
     near = np.argsort(distance, axis=1)[:, :NEIGHBOURS]

@@ -19,7 +19,7 @@ from skindb.fit.corrections import (
 from skindb.fit.lumitexels import lumitexels
 from skindb.numerics.statistics import NORMAL_PER_MEDIAN
 from skindb.schema import dataset, label, variables
-from skindb.types import Array
+from skindb.types import Array, finite_rows, lengths
 
 MIN_TAKES = 3  # of a light; the median of two is a mean, which one wrong gain spoils
 # variance of a median over that of a mean, of many normal values
@@ -42,7 +42,7 @@ def take_residuals(
     fitted = model["fitted"].to_dataset()
     dome = capture["dome"].to_dataset()
     normal = fitted[variables.SHADING_NORMAL].values
-    rows = np.flatnonzero(np.isfinite(normal).all(axis=1))
+    rows = np.flatnonzero(finite_rows(normal))
     samples = lumitexels(capture).isel(surfel=rows)
     samples = samples.assign(surfel_normal=label("surfel_normal", normal[rows]))
     applied = None
@@ -93,7 +93,7 @@ def common_light_errors(
     ]
     turned = misfit[1] < MAX_LEFT_BY_OFFSETS * misfit[0]
     common = commons[turned]
-    distance = np.linalg.norm(positions, axis=1)
+    distance = lengths(positions)
     logs = commons[0].logs
     spread, spread_left = (
         _median([gain_spread(row, positions / distance[:, None]) for row in rows])
@@ -199,7 +199,7 @@ class Common:
             offset[shared], others_offset[:, shared], error = _medians(
                 offsets[:, shared]
             )
-            self.offset_error[shared] = np.linalg.norm(error, axis=1)
+            self.offset_error[shared] = lengths(error)
         self.errors = LightErrors(np.exp(log), offset)
         self.others = [
             LightErrors(*errors)

@@ -16,7 +16,7 @@ from scipy.special import chdtrc
 
 from skindb.optics.transport import RATIO_MAX, transport_profile
 from skindb.schema import IDENTIFIED, ProbeStatus, check, dataset, label
-from skindb.types import Array, float64
+from skindb.types import Array, finite_rows, float64
 
 # relative errors of transport profiles: at one transport mean free path, which falls like
 # 1/r; at a distance; and of sigma_tr in fits to noise-free random walks
@@ -530,7 +530,7 @@ def translucency_map(surfels: xr.Dataset, sites: xr.Dataset) -> xr.Dataset:
     place = np.concatenate([place, place[mirrored] * [-1, 1, 1]])
     path = np.concatenate([path, path[mirrored]])
     good = np.concatenate([good, good[mirrored]])
-    placed = np.isfinite(place).all(1)
+    placed = finite_rows(place)
     position = float64(surfels["surfel_position"].values)
     weight = np.empty((len(position), len(place)))
     for j in np.flatnonzero(placed):

@@ -18,6 +18,7 @@ from skindb.types import (
     dots,
     finite_rows,
     float64,
+    lengths,
 )
 
 RAYS_PER_BLOCK = 1 << 15  # so that the arrays of the rays stay in the cache
@@ -199,4 +200,4 @@ def _refine(
     weight = np.clip(np.stack([1 - u - v, u, v], axis=1), 0.0, 1.0)
     weight /= weight.sum(axis=1, keepdims=True)
     point = np.einsum("nk,nki->ni", weight, triangles)
-    return weight, np.linalg.norm(point - origin, axis=1)
+    return weight, lengths(point - origin)

@@ -21,7 +21,7 @@ from numpy.random import Generator
 from scipy import stats
 
 from skindb.numerics.statistics import CONFIDENCE, ROUNDING, Moments
-from skindb.types import AnyArray, Array, Index, Mask, finite_rows, float64
+from skindb.types import AnyArray, Array, Index, Mask, finite_rows, float64, lengths
 
 Draw = AnyArray  # an order, signs or labels of the subjects, or many of them
 SUMS = 8  # values in memory per draw and quantity, or subject
@@ -484,7 +484,7 @@ def within_subjects_p(
     statistic, p, count
         See `between_groups_p`.
     """
-    orders = [_orders(row) for row in np.asarray(np.isfinite(values).all(axis=2))]
+    orders = [_orders(row) for row in finite_rows(values)]
     lengths = [len(order) for order in orders]
     choices, count = _draws(
         prod(lengths),
@@ -540,7 +540,7 @@ def classical_scaling(distance: Array) -> tuple[Array, Array, float]:
     place = vectors[:, ::-1][:, :2] * scale
     largest = place[np.abs(place).argmax(axis=0), np.arange(place.shape[1])]
     place = place * np.where(largest < 0, -1.0, 1.0)
-    mapped = np.linalg.norm(place[:, None] - place[None], axis=-1)
+    mapped = lengths(place[:, None] - place[None])
     square = ((mapped - distance) ** 2).sum() / ((distance**2).sum() or 1.0)
     return place, variance / total, float(np.sqrt(square))
 
