@@ -208,7 +208,7 @@ def calibrate_cameras(dome: DomeRecord, frames: CalibrationFrames) -> xr.Dataset
     with ThreadPoolExecutor(THREADS) as pool:
         rows = attempt_all(faults, calibrated, dome.cameras, pool=pool)
     coords = {
-        "camera": [camera.id for camera in dome.cameras],
+        "camera": dome.camera_ids,
         "response_level": np.linspace(0.0, 1.0, TABLE_ROWS),
         "channel": ["R", "G", "B"],
     }
@@ -227,7 +227,7 @@ def calibrated_cameras(
     InputError
         If the calibration lacks a camera, or the frames of the capture are not values of a sensor.
     """
-    ids = [camera.id for camera in dome.cameras]
+    ids = dome.camera_ids
     calibrated = of_devices(calibration, "camera", ids, where=where)
     require(
         not dome.cameras or dome.cameras[0].sensor.kind.bits,

@@ -377,7 +377,7 @@ def calibrate_lights(
             "target_used_fraction": [fit.used for fit in fits],
         },
         coords={
-            "light": [light.id for light in dome.lights],
+            "light": dome.light_ids,
             "channel": ["R", "G", "B"],
         },
     )
@@ -452,7 +452,7 @@ def calibrated_dome(
     InputError
         If the calibration lacks a light.
     """
-    ids = [light.id for light in dome.lights]
+    ids = dome.light_ids
     lights = of_devices(calibration, "light", ids, where=where)
     intensities = lights["calibrated_intensity"].values
     exponents = lights["calibrated_falloff"].values
@@ -520,7 +520,7 @@ def rig_dome(dome: DomeRecord, calibration: xr.Dataset, *, where: str) -> DomeRe
         "other ids or positions of the lights",
         "remove the key calibration of capture.json, or calibrate from takes of this dome",
     )
-    own = calibration.reindex(light=[light.id for light in dome.lights])
+    own = calibration.reindex(light=dome.light_ids)
     gains = own["rig_light_gain"].fillna(1.0).values
     offsets = own["rig_light_offset"].fillna(0.0).values
     lights = (
@@ -532,7 +532,7 @@ def rig_dome(dome: DomeRecord, calibration: xr.Dataset, *, where: str) -> DomeRe
         )
         for light, gain, offset in zip(dome.lights, gains, offsets, strict=True)
     )
-    names = [camera.id for camera in dome.cameras]
+    names = dome.camera_ids
     sensitivity = calibration["rig_camera_gain"].reindex(camera=names, fill_value=1.0)
     cameras = (
         replace(camera, gain=tuple(gain.tolist()))
@@ -613,7 +613,7 @@ def calibrate_positions(dome: DomeRecord, ball: BallFrames) -> xr.Dataset:
             "position_ray_count": list(counts),
             "position_miss": [np.sqrt(np.mean(fit.miss**2)) for fit in positions],
         },
-        coords={"light": [light.id for light in dome.lights], "xyz": ["x", "y", "z"]},
+        coords={"light": dome.light_ids, "xyz": ["x", "y", "z"]},
     )
 
 
@@ -650,7 +650,7 @@ def positioned_dome(
     InputError
         If the calibration lacks a light.
     """
-    ids = [light.id for light in dome.lights]
+    ids = dome.light_ids
     positions = of_devices(calibration, "light", ids, where=where)[
         "calibrated_position"
     ]

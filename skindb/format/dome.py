@@ -138,6 +138,16 @@ class DomeRecord:
     lobes: Mapping[str, tuple[float, ...]] | None = None
 
     @property
+    def light_ids(self) -> list[str]:
+        """Names of the lights."""
+        return [light.id for light in self.lights]
+
+    @property
+    def camera_ids(self) -> list[str]:
+        """Names of the cameras."""
+        return [camera.id for camera in self.cameras]
+
+    @property
     def frame_count(self) -> int:
         """Number of frames of the face."""
         return len(self.cameras) * len(self.lights) * len(self.exposures)
@@ -422,7 +432,7 @@ def _check_frames(dome: DomeRecord, fields: Fields) -> None:
 
 def _views(dome: DomeRecord) -> Iterator[tuple[str, str, dict[str, str], CameraRecord]]:
     """Key, template and names of every frame the folder must hold, and its camera."""
-    lights = [light.id for light in dome.lights]
+    lights = dome.light_ids
     parts = [("frames", dome.frames, lights, dome.cameras)]
     if dome.dark:
         parts.append(("dark", dome.dark, [""], dome.cameras))

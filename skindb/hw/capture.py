@@ -82,10 +82,12 @@ def planned_schedule(setup: Setup, plan: CapturePlan) -> Schedule:
         If the sequence cannot be completed in the wanted time.
     """
     exposures = setup.dome.exposures
-    schedule = plan_schedule(setup.lights, exposures, seconds=plan.seconds)
+    schedule = plan_schedule(setup.dome.light_ids, exposures, seconds=plan.seconds)
     if plan.slow:
         schedule = slowed_schedule(schedule)
-        shortest = slowed_schedule(plan_schedule(setup.lights, exposures)).seconds
+        shortest = slowed_schedule(
+            plan_schedule(setup.dome.light_ids, exposures)
+        ).seconds
         if plan.seconds is not None and plan.seconds < shortest:
             raise input_error(
                 "sequence",
@@ -157,7 +159,7 @@ def run_capture(
             notes += rehearsal_notes(remaining, override)
         run = _run_lights(session, devices, remaining, light, override, progress)
         _keep_run(session, run, setup)
-        require_complete(run, setup.cameras)
+        require_complete(run, setup.dome.camera_ids)
         notes += run.notes
     notes += _measure_sites(session, setup, devices, plan, place, progress or silent)
     write_capture(session, setup, subject, files=files)
@@ -236,8 +238,14 @@ def _require_devices(setup: Setup, devices: Devices, plan: CapturePlan) -> None:
     faults = []
     dome = devices.dome
     for where, kind, needed, present, cure in (
-        (dome.link.name, "light", setup.lights, dome.lights, "correct the ids"),
-        ("cameras", "camera", setup.cameras, devices.cameras.ids, "set up its folder"),
+        (dome.link.name, "light", setup.dome.light_ids, dome.lights, "correct the ids"),
+        (
+            "cameras",
+            "camera",
+            setup.dome.camera_ids,
+            devices.cameras.ids,
+            "set up its folder",
+        ),
     ):
         if missing := sorted(set(needed) - set(present)):
             rule = f"must have every {kind} of dome.json"

@@ -248,16 +248,6 @@ class Setup:
     probe: Mapping[str, Any] | None  # content of probe.json
     brackets: Mapping[str, float]  # id of an exposure of the probe -> seconds
 
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """Ids of the cameras."""
-        return tuple(camera.id for camera in self.dome.cameras)
-
-    @property
-    def lights(self) -> tuple[str, ...]:
-        """Ids of the lights."""
-        return tuple(light.id for light in self.dome.lights)
-
 
 def read_setup(folder: Path) -> Setup:
     """Read the folder of a set-up; a session takes its own dark frames.
@@ -305,7 +295,7 @@ def require_space(folder: Path, setup: Setup, steps: int) -> None:
     require(
         free >= needed,
         str(folder),
-        f"{steps} steps of {len(setup.cameras)} cameras need up to {needed / 1e9:.1f} GB",
+        f"{steps} steps of {len(setup.dome.cameras)} cameras need up to {needed / 1e9:.1f} GB",
         f"{free / 1e9:.1f} GB free",
         "free some space, or choose another disk",
     )
@@ -326,7 +316,7 @@ def remaining_schedule(
 
 def keep_frames(session: Unfinished, run: DomeRun, setup: Setup) -> None:
     """Copy the frames of complete steps, and record them in `unfinished.json`."""
-    cameras = setup.cameras
+    cameras = setup.dome.camera_ids
     entries = session.sequence
     missing = run.missing(cameras)
     offset = max((float(entry["t_off"]) for entry in entries), default=0.0)
@@ -452,7 +442,7 @@ def write_capture(
     has_dark = all(
         (out / dark.format(exposure=e, camera=c)).is_file()
         for e in setup.dome.exposures
-        for c in setup.cameras
+        for c in setup.dome.camera_ids
     )
     dome |= {
         "frames": f"{FRAMES}{suffix}",

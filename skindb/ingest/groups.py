@@ -191,7 +191,7 @@ def probe_group(
 
 def sequence_group(sequence: SequenceRecord, dome: DomeRecord) -> xr.Dataset:
     """Group "sequence": the steps of the dome in the order in which they were executed."""
-    lights = [light.id for light in dome.lights]
+    lights = dome.light_ids
     exposures = list(dome.exposures)
     variables = {
         "step_light": [lights.index(name) for name in sequence.light],
@@ -227,6 +227,6 @@ def photograph_group(photographs: Mapping[tuple[int, int], Image]) -> xr.Dataset
 
 def _dome_names(dome: DomeRecord) -> dict[str, list[str]]:
     return {
-        "light": [light.id for light in dome.lights],
-        "camera": [camera.id for camera in dome.cameras],
+        "light": dome.light_ids,
+        "camera": dome.camera_ids,
     }

@@ -144,7 +144,7 @@ def describe_samples(
     parts = {WHOLE_SURFACE: _quantiles(count)}
     for name, region in zip(surfels.region_names, surfels.region.T, strict=True):
         parts[name] = _quantiles(count[region])
-    cameras = [camera.id for camera in dome.cameras]
+    cameras = dome.camera_ids
     lights = zip(dome.lights, views.sum(axis=1), strict=True)
     return {
         "of": int(views.size),

@@ -63,8 +63,8 @@ def plan_session(
     schedule = with_markers(planned_schedule(setup, plan), marker_light(setup.dome))
     assessment = assess(schedule)
     lines = [
-        f"{len(setup.lights)} lights, {len(setup.dome.exposures)} exposures, "
-        f"{len(setup.cameras)} cameras: {assessment}"
+        f"{len(setup.dome.lights)} lights, {len(setup.dome.exposures)} exposures, "
+        f"{len(setup.dome.cameras)} cameras: {assessment}"
     ]
     if brackets := setup.brackets:
         sites = "each site that --sites names"
@@ -409,7 +409,7 @@ def _devices(
             stack.callback(connected.close)
             return connected
 
-        cameras = FolderCameras(watched, setup.cameras, clock=clock)
+        cameras = FolderCameras(watched, setup.dome.camera_ids, clock=clock)
         dome = Dome(link("dome"))
         if not plan.sites or (laboratory is None and not parameters.probe):
             yield Devices(dome, cameras)
@@ -442,8 +442,8 @@ def _laboratory(
             f"{frames} in {subject}",
             "name another capture; skindb simulate writes some",
         )
-    lights = [light.id for light in dome.lights]
-    cameras = [camera.id for camera in dome.cameras]
+    lights = dome.light_ids
+    cameras = dome.camera_ids
     faults = laboratory_faults(parameters.faults, lights, cameras)
     watched = beside / "frames"
     clock = SimulatedClock(time.time())
