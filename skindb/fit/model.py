@@ -43,7 +43,7 @@ from skindb.schema.cohort import EVEN
 from skindb.schema.consent import honour_consent
 from skindb.schema.label import take_attrs
 from skindb.threads import on_one_blas_thread
-from skindb.types import Float64, Progress
+from skindb.types import Float64, Progress, silent
 
 COMPILING = "compiling, only after an installation"
 COPIED_GROUPS = ("mesh", "dome", "probe")
@@ -61,7 +61,7 @@ def fit_model(
     parameters: FitParameters | None = None,
     *,
     dictionary: Dictionary | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> xr.DataTree:
     """Fit a reflectance model to the capture of one take.
 
@@ -108,7 +108,7 @@ def first_pass(
     parameters: FitParameters | None = None,
     *,
     dictionary: Dictionary | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> xr.DataTree:
     """The first half of `fit_model`: normals, diffuse reflectance and the fit by the dictionary.
 
@@ -211,7 +211,7 @@ def second_pass(
     first: xr.DataTree,
     *,
     dictionary: Dictionary | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> xr.DataTree:
     """The second half of `fit_model`: reduced basis, refit, errors at held-out samples,
     outliers, translucency.
@@ -412,7 +412,7 @@ class StageTimer:
     number of steps.
     """
 
-    progress: Progress | None
+    progress: Progress
     seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
@@ -421,20 +421,17 @@ class StageTimer:
         stage is one step.
         """
         begin = time.perf_counter()
-        if self.progress is None:
+        report = self.progress
+        ticker = _Ticker(name, report)
+        report(name, 0, 1)
+        with (
+            ticker,
+            reported_compilation(
+                lambda: report(f"{name} ({COMPILING})", ticker.done, ticker.total)
+            ),
+        ):
             yield
-        else:
-            report = self.progress
-            ticker = _Ticker(name, self.progress)
-            report(name, 0, 1)
-            with (
-                ticker,
-                reported_compilation(
-                    lambda: report(f"{name} ({COMPILING})", ticker.done, ticker.total)
-                ),
-            ):
-                yield
-            report(name, ticker.total, ticker.total)
+        report(name, ticker.total, ticker.total)
         self.seconds[name] = round(time.perf_counter() - begin, 3)
 
 

@@ -109,7 +109,7 @@ def run_capture(
     files: Mapping[str, Path],
     override: Override | Rehearsal | None = None,
     place: Callable[[str, int], None] = lambda _site, _number: None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> dict[str, Any]:
     """Photograph a subject, measure sites with the probe, and write the capture folder.
 
@@ -161,7 +161,7 @@ def run_capture(
         _keep_run(session, run, setup)
         require_complete(run, setup.dome.camera_ids)
         notes += run.notes
-    notes += _measure_sites(session, setup, devices, plan, place, progress or silent)
+    notes += _measure_sites(session, setup, devices, plan, place, progress)
     write_capture(session, setup, subject, files=files)
     return _report(session, schedule, light, run, notes)
 
@@ -172,7 +172,7 @@ def _run_lights(
     remaining: Schedule,
     light: str,
     override: Override | Rehearsal | None,
-    progress: Progress | None,
+    progress: Progress,
 ) -> DomeRun:
     """Run the remaining steps; the flashes and their confirmation are recorded before."""
     assessment = require_safe(remaining, override)

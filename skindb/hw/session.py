@@ -103,7 +103,7 @@ def capture_dome(
     marker_light: str,
     override: Override | Rehearsal | None = None,
     begin: Callable[[Schedule], None] = lambda _part: None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> DomeRun:
     """Run a sequence, and repeat the steps with missing frames while the subject is still seated.
 
@@ -137,7 +137,6 @@ def capture_dome(
         switched on. A refused repetition is not an error: `stopped` gives the reason,
         and the frames captured so far are kept.
     """
-    report = progress or silent
     require_safe(schedule, override)
     run = DomeRun(schedule, [None] * len(schedule.steps))
     clock = dome.link.clock
@@ -162,7 +161,7 @@ def capture_dome(
         now = clock.monotonic()
         begin_time = begin_time or now
         reports = _run_part(
-            dome, part, partial(report, "repeat" if attempt else "capture")
+            dome, part, partial(progress, "repeat" if attempt else "capture")
         )
         run.stopped = reports.stopped
         reports.shift(round(1e6 * (now - begin_time)))

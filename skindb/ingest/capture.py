@@ -25,7 +25,7 @@ from skindb.calibration.frame_checks import (
 from skindb.calibration.irradiance import light_intensities
 from skindb.calibration.radiance import FrameMerger, frame_mergers
 from skindb.elementwise import thread_count
-from skindb.errors import Fault, InputError, attempt, grouped
+from skindb.errors import Fault, InputError, attempt, grouped, require
 from skindb.format.dome import DomeRecord
 from skindb.format.folder import Capture
 from skindb.format.frames import Digests
@@ -65,11 +65,7 @@ from skindb.ingest.refinement import (
     refine_cameras,
 )
 from skindb.ingest.relief import NO_SCAN_DEGREES, Relief, estimate_relief
-from skindb.ingest.report import (
-    capture_provenance,
-    describe_samples,
-    require_fit_consent,
-)
+from skindb.ingest.report import capture_provenance, describe_samples
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import (
     SurfelSet,
@@ -93,7 +89,7 @@ def ingest_capture(
     parameters: IngestParameters | None = None,
     *,
     scratch: str | Path,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Iterator[xr.DataTree]:
     """Turn a capture folder into a DataTree of kind "capture": samples of light at
     surfels of the scan.
@@ -126,20 +122,25 @@ def ingest_capture(
     >>> with ingest_capture(capture, scratch="scratch") as tree:  # doctest: +SKIP
     ...     model = skindb.fit.fit_model(tree)
     """
-    report = progress or silent
     parameters = parameters or IngestParameters()
-    require_fit_consent(capture)
-    report("check", 1, 1)
+    require(
+        "fit" in capture.consent_scope,
+        f"{capture.folder / 'capture.json'}[consent][scope]",
+        "ingest needs the scope 'fit'",
+        ", ".join(capture.consent_scope) or "nothing",
+        "ask the subject, then correct it",
+    )
+    progress("check", 1, 1)
     relief = None
     if not capture.has_scan:
         capture, relief = _with_relief(capture, parameters.spacing_mm)
-        report("relief", 1, 1)
+        progress("relief", 1, 1)
     surfels = build_surfels(
         capture, spacing_mm=parameters.spacing_mm, planar=relief is not None
     )
-    report("surfels", 1, 1)
+    progress("surfels", 1, 1)
     groups = {"mesh": mesh_group(capture, surfels), "atlas": atlas_group(surfels)}
-    begun = capture, surfels, parameters, report, relief, groups
+    begun = capture, surfels, parameters, progress, relief, groups
     with ExitStack() as stack:
         if capture.dome is None:
             run = _Run(*begun)
@@ -287,7 +288,7 @@ class _DomeRun(_Run):
         if groups and self.dome.sequence is not None:
             groups["sequence"] = sequence_group(self.dome.sequence, self.dome)
         self.groups |= groups
-        self.digests |= {Path(x): digest for x, digest in self.spool.digests.items()}
+        self.digests |= self.spool.digests
 
     def _dome_groups(self) -> dict[str, xr.Dataset]:
         surfels = self.surfels

@@ -198,18 +198,18 @@ def _table_light(words: Sequence[str], header: Sequence[str], place: str) -> Lig
     values = numbers(
         [cells.get(key, "") for key in (COLUMNS if distant else POSITION_COLUMNS)]
     )
-    gain = numbers([cells.get(INTENSITY, "1")])[0]
+    gain = numbers([cells.get(INTENSITY, "1")])[0] or 0.0
     vector = np.array([np.nan if value is None else value for value in values])
     usable = 0 < np.linalg.norm(vector) < np.inf
     require(
-        bool(name) and bool(usable) and gain is not None and 0 < gain < np.inf,
+        name and usable and 0 < gain < np.inf,
         place,
         "must be a picture and the direction x, y, z to its light (or x_mm, y_mm, z_mm "
         "of a header); an intensity is positive",
         short(", ".join(words)),
         "correct the line",
     )
-    return Light(name, vector, distant, float(gain or 1.0))
+    return Light(name, vector, distant, gain)
 
 
 def _table_fault(path: Path, rule: str, found: str) -> InputError:

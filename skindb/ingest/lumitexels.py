@@ -301,8 +301,7 @@ class Sampler:
             levels.median[j, c] = median
             levels.bright[j, c] = bright
         levels.highest[j, c], levels.clipped[j, c] = highest_value(merger, frames)
-        names = {str(path): digest for path, digest in digests.items()}
-        self.spool.put(j, c, samples, outcome, names)
+        self.spool.put(j, c, samples, outcome, digests)
 
     def _gathered(
         self, merged: MergedView, shot: CameraSampling, surfels: Mask, j: int

@@ -109,9 +109,7 @@ def import_images(
     source, out = Path(source), Path(out)
     chosen = _parameters(parameters, "pictures of one camera", "cameras", "scan")
     _require_writable(out, person)
-    files = _pictures(source)
-    masks = [file for file in files if MASK.search(file.stem.lower())]
-    files = [file for file in files if file not in masks]
+    files, masks = _pictures(source)
     require(
         chosen.mask is not None or len(masks) < 2,
         str(source),
@@ -192,13 +190,13 @@ def import_olat(
     table = read_lights(_table_file(source, chosen.lights))
     devices = read_cameras(source, chosen.cameras)
     names = [light.name for light in table]
-    pattern, files = _olat_files(source, names, [str(c["id"]) for c in devices])
+    cameras = [str(device["id"]) for device in devices]
+    pattern, files = _olat_files(source, names, cameras)
     frames = _Frames(out, next(iter(files.values())), chosen.response)
     ids = _ids(names)
     light_ids = dict(zip(names, ids, strict=True))
-    camera_ids = _ids([str(c["id"]) for c in devices])
-    by_name = {str(device["id"]): device for device in devices}
-    for device, name in zip(devices, camera_ids, strict=True):
+    by_name = dict(zip(cameras, devices, strict=True))
+    for device, name in zip(devices, _ids(cameras), strict=True):
         device["id"] = name
     meshes = sorted([*source.glob("*.ply"), *source.glob("*.obj")])
     scan = chosen.scan or _only(meshes)
@@ -451,8 +449,8 @@ def _table_file(source: Path, given: Path | None) -> Path:
     return table
 
 
-def _pictures(source: Path) -> list[Path]:
-    """Pictures of a folder, numbers in their names in numerical order."""
+def _pictures(source: Path) -> tuple[list[Path], list[Path]]:
+    """Pictures of a folder, numbers in their names in numerical order, and its masks."""
     require(
         source.is_dir(),
         str(source),
@@ -463,13 +461,15 @@ def _pictures(source: Path) -> list[Path]:
     files = [x for x in source.iterdir() if x.suffix.lower() in SUFFIXES]
     files = [x for x in files if x.is_file() and not x.name.startswith(".")]
     require(
-        bool(files),
+        files,
         str(source),
         f"the folder must have pictures ({FORMATS})",
         "none",
         "convert raw and HEIC files to TIFF",
     )
-    return sorted(files, key=_natural)
+    files = sorted(files, key=_natural)
+    masks = [file for file in files if MASK.search(file.stem.lower())]
+    return [file for file in files if file not in masks], masks
 
 
 def _natural(path: Path) -> list[tuple[int, int, str]]:
@@ -553,9 +553,7 @@ def _folded(name: str) -> str:
 
 def _from_ball(folder: Path, files: Sequence[Path]) -> list[Light]:
     """Directions of the lights of `files`, from pictures of a mirror ball."""
-    balls = _pictures(folder)
-    masks = [file for file in balls if MASK.search(file.stem.lower())]
-    balls = [file for file in balls if file not in masks]
+    balls, masks = _pictures(folder)
     require(
         len(masks) == 1 and len(balls) == len(files),
         str(folder),
@@ -585,7 +583,7 @@ def _mask(path: Path | None, size: tuple[int, int]) -> Mask:
         return np.ones(size, bool)
     inside = _bright(path)
     require(
-        bool(inside.any()),
+        inside.any(),
         str(path),
         "a mask must be bright on the subject",
         "no bright pixel",

@@ -136,7 +136,7 @@ def estimate_relief(
         normal = photometric_normals(values, lit, dome.lights, points, -rays)
         known = finite_rows(normal)
         require(
-            bool(known.any()),
+            known.any(),
             f"{dome.file}[frames]",
             f"at least {MIN_LIGHTS} lights that are not in a plane must reach a pixel",
             f"none of {rows * columns:,} pixels is lit by so many",
@@ -147,7 +147,7 @@ def estimate_relief(
     width = step * camera.pixel_width(np.zeros(3))
     faces = _faces(known, depth, width)
     require(
-        len(faces) > 0,
+        len(faces),
         f"{dome.file}[frames]",
         "neighbouring pixels must be lit by three lights to form a surface",
         "only pixels without such neighbours",

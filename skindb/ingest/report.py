@@ -6,7 +6,7 @@ surfel, region, camera and light.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb.errors import require
 from skindb.format.dome import DomeRecord
 from skindb.format.folder import WHOLE_SURFACE, Capture
 from skindb.format.frames import Digests
@@ -27,17 +26,6 @@ QUANTILES = {"p5": 0.05, "p50": 0.5, "p95": 0.95, "max": 1.0}
 COLUMNS = ("mean", *QUANTILES, "seen")
 
 
-def require_fit_consent(capture: Capture) -> None:
-    """Require the consent for fits, without which a capture is not ingested."""
-    require(
-        "fit" in capture.consent_scope,
-        f"{capture.folder / 'capture.json'}[consent][scope]",
-        "ingest needs the scope 'fit'",
-        ", ".join(capture.consent_scope) or "nothing",
-        "ask the subject, then correct it",
-    )
-
-
 def capture_provenance(
     capture: Capture, parameters: Mapping[str, Any], digests: Digests
 ) -> dict[str, Any]:
@@ -47,7 +35,7 @@ def capture_provenance(
     from them in the order of their paths, as the frames are decoded in any order.
     """
     inputs = {
-        file.relative_to(capture.folder).as_posix(): _sha256([file])
+        file.relative_to(capture.folder).as_posix(): _sha256(file)
         for file in _files(capture)
     }
     dome = capture.dome
@@ -58,11 +46,14 @@ def capture_provenance(
         files.update(capture.probe.frame_files())
     frames = sorted(files)
     if frames:
-        frame_digests = [digests.get(path) or _sha256([path]) for path in frames]
+        frame_digests = [digests.get(path) or _sha256(path) for path in frames]
         inputs[FRAMES] = hashlib.sha256("".join(frame_digests).encode()).hexdigest()
+    crop = {} if capture.crop is None else {"crop": asdict(capture.crop)}
+    by = capture.calibrated_by
+    calibrated = {"calibrated_by": dict(by)} if by else {}
     optional = {
         "calibration": capture.calibration,
-        "calibrated_by": dict(capture.calibrated_by or {}),
+        **calibrated,
         "override": dict(capture.override),
         "relative_exposure": 0.0 if dome is None else dome.relative_exposure,
     }
@@ -75,7 +66,7 @@ def capture_provenance(
         "consent_reference": capture.consent_reference,
         **{key: value for key, value in optional.items() if value},
         "command": "ingest",
-        "parameters": _all_parameters(capture, parameters),
+        "parameters": {**parameters, **crop, **calibrated},
         "seeds": {},
         "inputs": inputs,
         "frame_count": len(frames),
@@ -95,27 +86,13 @@ def _files(capture: Capture) -> list[Path]:
     """All files of a capture except frames."""
     cameras = () if capture.dome is None else capture.dome.cameras
     tables = {camera.sensor.response_file for camera in cameras}
-    files = {capture.mesh_file, *tables} - {None}
+    files = {capture.mesh_file, *tables}
     return [*capture.json_files, *sorted(file for file in files if file is not None)]
 
 
-def _all_parameters(capture: Capture, parameters: Mapping[str, Any]) -> dict[str, Any]:
-    optional: dict[str, Any] = {}
-    if capture.crop is not None:
-        optional["crop"] = asdict(capture.crop)
-    if capture.calibrated_by:
-        optional["calibrated_by"] = dict(capture.calibrated_by)
-    return {**parameters, **optional}
-
-
-def _sha256(files: Iterable[Path]) -> str:
-    """One digest of the contents of files, which are read in blocks."""
-    digest = hashlib.sha256()
-    for file in files:
-        with file.open("rb") as stream:
-            while block := stream.read(1 << 20):
-                digest.update(block)
-    return digest.hexdigest()
+def _sha256(file: Path) -> str:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def cleaning_lines(provenance: Mapping[str, Any], *, places: bool) -> list[str]:

@@ -4,16 +4,15 @@ import errno
 import os
 import threading
 import uuid
-from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryFile
-from types import TracebackType
 from typing import Any, Self
 
 import dask.array as da
 import numpy as np
 
 from skindb.files import make_private
+from skindb.format.frames import Digests
 from skindb.ingest._sample_kernels import tally
 from skindb.schema.label import BLOCK_SURFELS
 from skindb.types import Bytes, Float32, Half, Values16
@@ -46,7 +45,7 @@ class Spool:
         # number of samples of each view
         self.views = np.zeros((lights, cameras), np.int64)
         self.counts = np.zeros((STATES, surfels), np.int32)
-        self.digests: dict[str, str] = {}
+        self.digests = Digests()
         self.pictures: dict[str, Float32] = {}
         self._guard = threading.Lock()
 
@@ -56,12 +55,7 @@ class Spool:
         os.ftruncate(self._file.fileno(), 6 * int(np.prod(self.shape)))
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._file.close()
 
     def put(
@@ -70,7 +64,7 @@ class Spool:
         camera: int,
         samples: Values16,
         outcome: Bytes,
-        digests: Mapping[str, str],
+        digests: Digests,
     ) -> None:
         """Keep a view: (3, n) bits of half floats, the outcome for each surfel, and the
         digests of its frames.
@@ -122,11 +116,9 @@ class Spool:
         for i in range(0, samples.shape[1], TILE):
             part = rows[: samples.shape[1] - i]
             for k, row in enumerate(part, i):
-                buffer = row.data.cast("B")
-                if (
-                    os.preadv(self._file.fileno(), [buffer], 2 * (k * n + begin))
-                    != row.nbytes
-                ):
+                place = 2 * (k * n + begin)
+                count = os.preadv(self._file.fileno(), [row.data.cast("B")], place)
+                if count != row.nbytes:
                     raise OSError(errno.EIO, "samples are truncated", str(self.folder))
             for j in range(0, len(samples), TILE):
                 samples[j : j + TILE, i : i + TILE] = part[:, j : j + TILE].T

@@ -70,8 +70,7 @@ class SurfelSet:
     def cosine(self, camera: CameraRecord, part: slice = slice(None)) -> Float64:
         """Cosine (n,) between normals and the direction to the camera."""
         way = camera.centre - self.position[part]
-        cosine = dots(way, self.normal[part])
-        return cosine / lengths(way)
+        return dots(way, self.normal[part]) / lengths(way)
 
     def spacing(self) -> float:
         """Distance [mm] of neighbours in an even lattice of the same density."""
@@ -206,9 +205,8 @@ def _site_position(
     for name in (SITE_LANDMARK.get(site, site), site):
         if name in landmarks:
             return float64(landmarks[name])
-    if site not in surfels.region_names:
-        return np.full(3, np.nan)
-    member = surfels.region[:, surfels.region_names.index(site)]
+    region = [name == site for name in surfels.region_names]
+    member = surfels.region[:, region].any(axis=1)
     x = surfels.position[:, 0]
     preferred = [x > 0]
     if site == "neck":

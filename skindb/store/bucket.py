@@ -219,19 +219,12 @@ class Bucket:
         """
         path = self._path(key)
         try:
-            return float(
-                self._ask(key, lambda: self._store.head(path))[
-                    "last_modified"
-                ].timestamp()
-            )
+            metas = [self._ask(key, lambda: self._store.head(path))]
         except FileNotFoundError:
-            times = [
-                meta["last_modified"].timestamp()
-                for meta in self._objects(key).values()
-            ]
-            if not times:
+            metas = [*self._objects(key).values()]
+            if not metas:
                 raise
-            return float(max(times))
+        return float(max(meta["last_modified"] for meta in metas).timestamp())
 
     def now(self) -> float:
         """Time of the clock of the bucket in whole seconds, from an object that is
