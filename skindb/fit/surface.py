@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -131,7 +131,7 @@ def refit(
         are above 0: they are too small for lobes so sharp that only a few samples see
         them, and for weights that noise moves to their bound.
     """
-    return _judged(lumitexels, basis, mode=mode, eta=eta, min_width=min_width).surfels
+    return _judged(lumitexels, basis, mode=mode, eta=eta, min_width=min_width)[0]
 
 
 def held_out_error(
@@ -158,9 +158,9 @@ def held_out_error(
         cameras `held_out_camera_error` and `held_out_camera_error_perceptual`. NaN
         where the surfel has no such sample or nothing was fitted.
     """
-    judged = _judged(
+    judged, _ = _judged(
         lumitexels, basis, mode="linear", eta=eta, evaluate=True, min_samples=1
-    ).surfels
+    )
     residuals = ("fit_residual", "fit_residual_perceptual")
     return dataset(
         {
@@ -199,7 +199,7 @@ def find_outliers(
         `camera_outlier_fraction`, `camera_misfit` and `frame_misfit` (light, camera).
         NaN where there are too few samples to decide.
     """
-    judged = _judged(
+    judged, counts = _judged(
         lumitexels, basis, mode="perceptual", eta=eta, evaluate=True, outliers=True
     )
     coords = {
@@ -207,8 +207,8 @@ def find_outliers(
         for dim in ("light", "camera")
         if dim in lumitexels.coords
     }
-    columns = {"outlier_fraction": judged.surfels["outlier_fraction"].values}
-    return dataset(columns | misfits(judged.counts), coords=coords)
+    columns = {"outlier_fraction": judged["outlier_fraction"].values}
+    return dataset(columns | misfits(counts), coords=coords)
 
 
 def refit_and_evaluate(
@@ -244,7 +244,7 @@ def refit_and_evaluate(
         1 * held_out["light_held_out"].values[:, None]
         + 2 * held_out["camera_held_out"].values[None, :]
     )
-    judged = _judged(
+    judged, counts = _judged(
         lumitexels, basis, mode=mode, eta=eta, held=held.astype(np.int64), outliers=True
     )
     # histograms of the fitted photographs alone
@@ -252,20 +252,13 @@ def refit_and_evaluate(
         dim: np.flatnonzero(held_out[f"{dim}_held_out"].values == 0)
         for dim in ("light", "camera")
     }
-    counts = judged.counts[np.ix_(fitted["light"], fitted["camera"])]
+    counts = counts[np.ix_(fitted["light"], fitted["camera"])]
     coords = {
         dim: held_out[dim].values[index]
         for dim, index in fitted.items()
         if dim in held_out.coords
     }
-    return judged.surfels, dataset(misfits(counts), coords=coords)
-
-
-class _Judged(NamedTuple):
-    """Variables of the surfels, and histograms (lights, cameras, bins) of residuals."""
-
-    surfels: xr.Dataset
-    counts: Index
+    return judged, dataset(misfits(counts), coords=coords)
 
 
 def _judged(
@@ -279,8 +272,9 @@ def _judged(
     evaluate: bool = False,
     held: Index | None = None,
     outliers: bool = False,
-) -> _Judged:
-    """Fit or only evaluate the parameters of the surfels, block by block.
+) -> tuple[xr.Dataset, Index]:
+    """Variables of the surfels, whose parameters are fitted or only evaluated block by
+    block, and histograms (lights, cameras, bins) of residuals.
 
     `elementwise` cannot sum over surfels: a task per block returns its surfels and
     histograms, which are summed.
@@ -316,7 +310,7 @@ def _judged(
     parts, counts = joined_blocks(judge, blocks)
     columns = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
     coords = {} if evaluate else surface.labels
-    return _Judged(dataset(columns, coords=coords), counts)
+    return dataset(columns, coords=coords), counts
 
 
 def _error_columns(judged: SurfaceFit, judgement: Judgement) -> dict[str, Array]:

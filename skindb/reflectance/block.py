@@ -83,19 +83,20 @@ def empty_fit(
         parameters = np.full((n, size), np.nan)
     columns = 0 if judgement.diffuse_error is None else size
     bins = BINS if judgement.outliers else 0
+    kkt, linear, perceptual, condition, half_angle, outlier = np.full((6, n), np.nan)
     return SurfaceFit(
         parameters=np.array(parameters, np.float64, order="C"),
-        kkt=np.full(n, np.nan),
-        residual=np.full(n, np.nan),
-        residual_perceptual=np.full(n, np.nan),
-        condition=np.full(n, np.nan),
+        kkt=kkt,
+        residual=linear,
+        residual_perceptual=perceptual,
+        condition=condition,
         samples=np.zeros(n, np.int32),
-        half_angle=np.full(n, np.nan),
+        half_angle=half_angle,
         iterations=np.zeros(n, np.int32),
         status=np.zeros(n, np.uint8),
         covariance=np.full((n, columns, columns), np.nan),
         held_error=np.full((n, 2, 2), np.nan),
-        outlier=np.full(n, np.nan),
+        outlier=outlier,
         counts=np.zeros((lights, cameras, bins), np.int64),
     )
 

@@ -45,13 +45,13 @@ from skindb.reflectance.model import (
     Judgement,
     Lamp,
     Points,
+    ReflectanceModel,
     SurfaceFit,
 )
 from skindb.reflectance.reduction import fitted_surfels
 from skindb.reflectance.sampling import tangents
 from skindb.reflectance.tables import NARROW_ANGLE, Table, tabulate
 from skindb.schema import FitStatus, check, dataset, variables
-from skindb.schema.notes import Omission
 from skindb.types import Array, Float32, float64, lengths
 
 ALBEDO_NODES = 24  # roughnesses at which the reflectance of a lobe is integrated
@@ -81,7 +81,7 @@ def _normal_albedo(index: float) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True)
-class GGX:
+class GGX(ReflectanceModel):
     """GGX lobes with a common refractive index of their Fresnel term."""
 
     BASIS_VARIABLE: ClassVar[str] = variables.LOBE_INDEX
@@ -127,24 +127,9 @@ class GGX:
         return (*self.PARAMETERS, *FIT_VARIABLES)
 
     @property
-    def labels(self) -> dict[str, tuple[str, ...]]:
-        """No variable has a dim of its own."""
-        return {}
-
-    @property
     def provenance(self) -> dict[str, Any]:
         """What the surface was fitted by."""
         return {"surface": f"GGX lobe, refractive index {self.index:g}"}
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """No parameter of a fit is changed."""
-        return {}
-
-    @property
-    def omissions(self) -> tuple[Omission, ...]:
-        """Nothing is omitted."""
-        return ()
 
     def parameters_of(self, fitted: xr.Dataset) -> Array:
         """Strength and roughness (n, 2)."""
@@ -235,10 +220,6 @@ class GGX:
         nodes, albedo = _normal_albedo(self.index)
         fraction = np.interp(parameters[:, ROUGHNESS], nodes, albedo[0])
         return parameters[:, STRENGTH] * fraction
-
-    def simplified(self, parameters: Array) -> tuple[GGX, Array, tuple[Omission, ...]]:
-        """The model as it is."""
-        return self, parameters, ()
 
     def resample(self, parameters: Array) -> tuple[Table, Array]:
         """Tables of lobes at `TABLES` roughnesses, and weights (n, TABLES) that interpolate

@@ -95,15 +95,17 @@ def refine_block(
         the parameters cannot be distinguished.
     """
     n = len(block.position)
+    error, shared, kkt = np.full((3, n), np.nan)
+    normal, diffuse, diffuse_error, diffuse_shared = np.full((4, n, 3), np.nan)
     out = JointFit(
-        normal=np.full((n, 3), np.nan),
-        normal_error=np.full(n, np.nan),
-        normal_shared=np.full(n, np.nan),
-        diffuse=np.full((n, 3), np.nan),
-        diffuse_error=np.full((n, 3), np.nan),
-        diffuse_shared=np.full((n, 3), np.nan),
+        normal=normal,
+        normal_error=error,
+        normal_shared=shared,
+        diffuse=diffuse,
+        diffuse_error=diffuse_error,
+        diffuse_shared=diffuse_shared,
         strength=np.full((n, LOBES), np.nan),
-        kkt=np.full(n, np.nan),
+        kkt=kkt,
         samples=np.zeros(n, np.int64),
     )
     graded = Lobes(

@@ -156,7 +156,8 @@ class ReflectanceModel(Protocol):
 
     @property
     def labels(self) -> dict[str, tuple[str, ...]]:
-        """Labels of the dims that only variables of this model have."""
+        """Labels of the dims that only variables of this model have; by default none."""
+        return {}
 
     @property
     def provenance(self) -> dict[str, Any]:
@@ -164,11 +165,17 @@ class ReflectanceModel(Protocol):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Parameters of the fit as they were used: rank, or number of components."""
+        """Parameters of the fit that were used otherwise: rank, or number of components; by
+        default none.
+        """
+        return {}
 
     @property
     def omissions(self) -> tuple[Omission, ...]:
-        """Parts of the model that are not computed, with a bound on the error."""
+        """Parts of the model that are not computed, with a bound on the error; by default
+        none.
+        """
+        return ()
 
     def parameters_of(self, fitted: xr.Dataset) -> Array:
         """Parameters (n, p) in `parameter_variables`."""
@@ -213,8 +220,9 @@ class ReflectanceModel(Protocol):
         self, parameters: Array
     ) -> tuple[ReflectanceModel, Array, tuple[Omission, ...]]:
         """The model and the parameters (n, p) without what reflects nothing at any of the
-        surfels.
+        surfels; by default as they are.
         """
+        return self, parameters, ()
 
     def resample(self, parameters: Array) -> tuple[Table, Array]:
         """Tables (nh, nd, np, k) and weights (n, k) whose mixtures are the surface term,
