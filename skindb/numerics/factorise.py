@@ -262,10 +262,15 @@ def _best_weights(XA: Array, H: Array, A: Array) -> Array:
 
 def _canonical(H: Array, mean: Array) -> Array:
     """H with rows of unit sum, ordered by their contribution to the mean of X (m,)."""
-    total = H.sum(axis=1, keepdims=True)
-    H = np.where(total > 0, H / np.where(total > 0, total, 1.0), 1.0 / H.shape[1])
+    H = unit_sum(H)
     contribution = mean @ H.T
     return H[np.argsort(-contribution, kind="stable")]
+
+
+def unit_sum(H: Array) -> Array:
+    """Rows (k, m) over their sums; even ones in place of 0."""
+    total = H.sum(axis=1, keepdims=True)
+    return np.where(total > 0, H / np.where(total > 0, total, 1.0), 1.0 / H.shape[1])
 
 
 @dataclass(frozen=True)

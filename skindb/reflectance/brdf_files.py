@@ -141,23 +141,20 @@ def _load(path: Path) -> dict[str, AnyArray]:
             "write it with skindb.reflectance.brdf_files.write_tables or numpy.savez",
         ) from None
     missing = [name for name in (TABLE, *NODES) if name not in arrays]
-    if missing:
-        rule = f"must contain {TABLE} and its nodes {', '.join(NODES)}"
-        raise input_error(
-            str(path),
-            rule,
-            f"no {', '.join(missing)}",
-            "add them, in sr^-1 and rad",
-        )
+    require(
+        not missing,
+        str(path),
+        f"must contain {TABLE} and its nodes {', '.join(NODES)}",
+        f"no {', '.join(missing)}",
+        "add them, in sr^-1 and rad",
+    )
     wrong = [name for name in (TABLE, *NODES) if arrays[name].dtype.kind not in "fiu"]
-    if wrong:
-        raise InputError(
-            Fault(
-                str(path),
-                "tables and nodes must be real numbers",
-                f"others in {', '.join(wrong)}",
-            )
-        )
+    require(
+        not wrong,
+        str(path),
+        "tables and nodes must be real numbers",
+        f"others in {', '.join(wrong)}",
+    )
     return arrays | {name: float64(arrays[name]) for name in NODES}
 
 
@@ -278,19 +275,21 @@ def read_merl(path: str | Path) -> tuple[Array, int]:
     try:
         data = Path(path).read_bytes()
     except OSError as error:
-        fault = Fault(
+        raise input_error(
             str(path),
             "must be a readable file",
             str(error.strerror),
             "choose a MERL .binary file",
-        )
-        raise InputError(fault) from None
+        ) from None
     dims = tuple(np.frombuffer(data[: min(len(data), 12) // 4 * 4], "<i4").tolist())
     want = 12 + 8 * 3 * int(np.prod(SHAPE))
-    if dims != SHAPE or len(data) != want:
-        content = f"the header {dims} and {len(data)} bytes"
-        rule = f"a MERL binary must have the header {SHAPE} and {want} bytes"
-        raise input_error(str(path), rule, content, "download it again")
+    require(
+        dims == SHAPE and len(data) == want,
+        str(path),
+        f"a MERL binary must have the header {SHAPE} and {want} bytes",
+        f"the header {dims} and {len(data)} bytes",
+        "download it again",
+    )
     values = np.frombuffer(data[12:], "<f8").reshape(3, *SHAPE)
     wrong = int((~np.isfinite(values)).sum())
     require(
@@ -301,11 +300,14 @@ def read_merl(path: str | Path) -> tuple[Array, int]:
         "download it again",
     )
     table = np.moveaxis(values, 0, -1) * SCALE
-    hole = np.asarray((table < 0).any(axis=-1))
-    if hole.all():
-        rule = "some cells must be measured"
-        content = "only negative values"
-        raise input_error(str(path), rule, content, "download it again")
+    hole = np.any(table < 0, axis=-1)
+    require(
+        not hole.all(),
+        str(path),
+        "some cells must be measured",
+        "only negative values",
+        "download it again",
+    )
     return np.where(hole[..., None], np.nan, table), int(hole.sum())
 
 

@@ -159,9 +159,7 @@ def evaluate_abc(parameters: Array, wi: Array, wo: Array) -> Array:
     for m, row in enumerate(parameters):
         kd = row[:3].mean()
         scale = row[3:6].mean()
-        b = row[6]
-        c = row[7]
-        index = row[8]
+        b, c, index = row[6:]
         lobe = np.exp(-c * np.log1p(b * lean))
         out[..., m] = (
             kd / np.pi

@@ -28,8 +28,7 @@ def evaluate_lobe(wi: Array, wo: Array, alpha: Array | float, index: float) -> A
     """
     light = np.maximum(wi[..., 2], MIN_COSINE_LOBE)
     camera = np.maximum(wo[..., 2], MIN_COSINE_LOBE)
-    half = wi + wo
-    half = unit(half)
+    half = unit(wi + wo)
     square = np.asarray(alpha) ** 2
     spread = square / (np.pi * (half[..., 2] ** 2 * (square - 1) + 1) ** 2)
     shadow = camera * np.sqrt(square + (1 - square) * light**2)

@@ -24,7 +24,7 @@ from scipy.optimize import minimize
 
 from skindb.cache import cached_arrays
 from skindb.errors import input_error, require
-from skindb.numerics.factorise import nmf
+from skindb.numerics.factorise import nmf, unit_sum
 from skindb.numerics.nnls import solve_nnls
 from skindb.optics.angles import directions
 from skindb.reflectance.dictionary import SOURCES, Dictionary
@@ -390,7 +390,7 @@ def factor_reflectance(systems: Systems, largest: int) -> list[Array]:
     # the error of the compressed space is a third of the noise, if the noise is 1 %
     identity = np.eye(len(lift))
     return [
-        _unit_sum(_descend(systems, identity, best[k], steps=POLISH))
+        unit_sum(_descend(systems, identity, best[k], steps=POLISH))
         for k in range(1, largest + 1)
     ]
 
@@ -490,8 +490,3 @@ def _cheapest_merges(systems: Systems, lift: Array, H: Array) -> list[Array]:
     return sorted(
         candidates, key=lambda basis: float(residuals(few, basis @ lift)[1].sum())
     )[:MERGES]
-
-
-def _unit_sum(H: Array) -> Array:
-    total = H.sum(axis=1, keepdims=True)
-    return np.where(total > 0, H / np.where(total > 0, total, 1.0), 1.0 / H.shape[1])
