@@ -146,6 +146,12 @@ def require(
         raise input_error(where, rule, found, cure)
 
 
+def require_none(faults: Sequence[Fault]) -> None:
+    """Raise an `InputError` with these faults if there are any."""
+    if faults:
+        raise InputError(faults)
+
+
 def attempt(
     faults: list[Fault], call: Callable[[], T], *, where: str = "{}"
 ) -> T | None:
@@ -176,6 +182,5 @@ def attempt_all(
         lambda item: attempt(faults, lambda: call(item), where=where(item)), items
     )
     completed = [result for result in results if result is not None]
-    if faults:
-        raise InputError(sorted(faults, key=str))
+    require_none(sorted(faults, key=str))
     return completed

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from skindb.errors import Fault, InputError
+from skindb.errors import require
 from skindb.fit.lumitexels import POLARISATION, cosines, directions
 from skindb.geometry.interreflection import bounce_transfer, tangent_frames
 from skindb.optics.fresnel import fresnel_transmittance
@@ -486,12 +486,13 @@ def bounced_light(
     """
     check(lumitexels, NEEDED, where="lumitexels")
     position, normal, light = (float64(lumitexels[name].values) for name in NEEDED[:3])
-    if len(position) != len(visible) or len(position) != len(diffuse):
-        counts = f"{len(position)}, {len(visible)} and {len(diffuse)} surfels"
-        rule = "samples, visibility and R_d must be of the same surfels"
-        raise InputError(
-            Fault("inter-reflection", rule, counts, "run skindb ingest --again")
-        )
+    require(
+        len(position) == len(visible) == len(diffuse),
+        "inter-reflection",
+        "samples, visibility and R_d must be of the same surfels",
+        f"{len(position)}, {len(visible)} and {len(diffuse)} surfels",
+        "run skindb ingest --again",
+    )
     reflectance = np.where(
         np.isfinite(diffuse), diffuse, np.nanmedian(diffuse, axis=0)
     ).astype(np.float32)

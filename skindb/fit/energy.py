@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 from scipy.special import erfcx
 
-from skindb.fit.lumitexels import POLARISATION, directions
+from skindb.fit.lumitexels import directions, polarisation
 from skindb.optics.diffusion import dipole_s
 from skindb.optics.fresnel import circular_reversal
 from skindb.parameters import (
@@ -70,7 +70,8 @@ def crossed_gloss(lumitexels: xr.Dataset, eta: float) -> float | None:
     """Mean fraction of the light from the surface that crossed polarisers pass, seen from
     the middle of the surfels; None if no light and camera are crossed.
     """
-    if not all(name in lumitexels for name in POLARISATION):
+    both = polarisation(lumitexels)
+    if not both.size:
         return None
     middle = lumitexels["surfel_position"].values.mean(axis=0, keepdims=True)
     lights, cameras = (
@@ -78,7 +79,6 @@ def crossed_gloss(lumitexels: xr.Dataset, eta: float) -> float | None:
         for device in ("light", "camera")
     )
     cosine = lengths(lights[:, None] + cameras) / 2  # of theta_d
-    both = np.outer(*(lumitexels[name].values for name in POLARISATION))
     gloss = 1 - both * circular_reversal(cosine, eta)
     crossed = gloss[gloss <= MAX_GLOSS_CROSSED]
     return float(crossed.mean()) if crossed.size else None

@@ -14,10 +14,10 @@ from skindb.fit.albedo import estimate_in_sequence
 from skindb.fit.joint import shared_lobes
 from skindb.fit.lumitexels import (
     GEOMETRY,
-    POLARISATION,
     block_of,
     directions,
     noise_inputs,
+    polarisation,
     scan_error,
 )
 from skindb.fit.surface import noise_floor
@@ -251,8 +251,8 @@ def _errors(
         for w in (wi, wo)
     ]
     value = np.einsum("nlcj,nj->nlc", evaluate_graded(wi, wo), refined.strength)
-    if all(name in part for name in POLARISATION):
-        both = np.outer(*(part[name].values for name in POLARISATION))
+    both = polarisation(part)
+    if both.size:
         apart = lengths(wi + wo) / 2  # cosine of theta_d
         value *= 1 - both * circular_reversal(apart, eta)
     value += passed[0] * passed[1] * refined.diffuse.mean(axis=1)[:, None, None] / np.pi

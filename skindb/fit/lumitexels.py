@@ -5,12 +5,13 @@ and in blocks of surfels.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, attempt, require_none
 from skindb.parameters import SCAN_ERROR_DEGREES
 from skindb.reflectance.model import UNKNOWN_NOISE, Block, Noise
 from skindb.schema import check, variables
@@ -71,22 +72,21 @@ def lumitexels(capture: xr.DataTree) -> xr.Dataset:
     InputError
         With every variable that is absent or does not fit the schema.
     """
-    parts: list[xr.Dataset] = []
+    parts: list[tuple[xr.Dataset, list[str]]] = []
     faults: list[Fault] = []
     for group, required in REQUIRED.items():
         dataset = xr.Dataset()
         if group in capture.children:
             dataset = capture[group].to_dataset()
         names = [*required, *(name for name in OPTIONAL[group] if name in dataset)]
-        try:
-            check(dataset, names, where=group)
-            parts.append(dataset[names])
-        except InputError as error:  # collects the faults of all groups
-            faults += error.faults
-    if faults:
-        raise InputError(faults)
+        attempt(faults, partial(check, dataset, names, where=group))
+        parts.append((dataset, names))
+    require_none(faults)
     merged = xr.merge(
-        parts, compat="override", join="override", combine_attrs="override"
+        [dataset[names] for dataset, names in parts],
+        compat="override",
+        join="override",
+        combine_attrs="override",
     )
     # geometry and noise are read once: 60 bytes per surfel, compared with 14 kB of
     # samples for a full dome
@@ -138,11 +138,11 @@ def block_of(arrays: Arrays) -> Block:
         normal=normal,
         diffuse=arrays.get("diffuse_reflectance", np.full_like(normal, np.nan)),
         noise=noise_of(arrays),
-        polarisation=_polarisation(arrays),
+        polarisation=polarisation(arrays),
     )
 
 
-def _polarisation(arrays: Arrays) -> Array:
+def polarisation(arrays: Arrays | xr.Dataset) -> Array:
     """Products (lights, cameras) of the degrees of polarisation; (0, 0) without polarisers."""
     if not all(name in arrays for name in POLARISATION):
         return np.zeros((0, 0))

@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 from dask.callbacks import Callback
 
-from skindb.errors import Fault, InputError
+from skindb.errors import input_error, require
 from skindb.fit.albedo import estimate_in_sequence
 from skindb.fit.choice import choose_corrections
 from skindb.fit.corrections import (
@@ -299,12 +299,15 @@ def _require_match(
         rule = "both passes need the same surface model and dictionary"
         cure = "give that of the first pass, or repeat it"
         source = str(next(iter(origin.values())))
-        raise InputError(Fault("dictionary", rule, source, cure))
+        raise input_error("dictionary", rule, source, cure)
     surfels = first["fitted"].sizes["surfel"]
-    if surfels != samples.sizes["surfel"]:
-        rule = "both passes need the same capture"
-        finding = f"{surfels} surfels of {samples.sizes['surfel']}"
-        raise InputError(Fault("first pass", rule, finding, "repeat the first pass"))
+    require(
+        surfels == samples.sizes["surfel"],
+        "first pass",
+        "both passes need the same capture",
+        f"{surfels} surfels of {samples.sizes['surfel']}",
+        "repeat the first pass",
+    )
 
 
 def _groups(

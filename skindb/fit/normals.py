@@ -77,8 +77,7 @@ def surfel_normals(
     """(n, 3) normals, standard and total error (n,) [degree]."""
     n = len(position)
     chosen = np.empty((n, 3))
-    error = np.empty(n)
-    total = np.empty(n)
+    error, total = np.empty((2, n))
     position, light, camera, scan = (
         np.ascontiguousarray(a, np.float64) for a in (position, light, camera, scan)
     )

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
-from skindb.errors import Fault, InputError
+from skindb.errors import require
 from skindb.fit.lumitexels import disc_angle, lumitexels, relative_reflectance
 from skindb.parameters import FitParameters
 from skindb.reflectance.dictionary import Dictionary
@@ -80,26 +80,26 @@ def plan_fit(
     """
     parameters = parameters or FitParameters()
     name = str(capture.attrs.get("take", capture.attrs.get("subject", "capture")))
-    if "samples" not in capture.children:
-        measured = (
-            "only the probe was measured"
-            if "probe" in capture.children
-            else "neither dome nor probe"
-        )
-        cure = "photograph the subject in the dome, or exclude this take"
-        raise InputError(
-            Fault(name, "a fit needs photographs of a dome", measured, cure)
-        )
-    surfels = capture["samples"].to_dataset()["sample_count"].values > 0
     probe = "probe" in capture.children
+    require(
+        "samples" in capture.children,
+        name,
+        "a fit needs photographs of a dome",
+        "only the probe was measured" if probe else "neither dome nor probe",
+        "photograph the subject in the dome, or exclude this take",
+    )
+    surfels = capture["samples"].to_dataset()["sample_count"].values > 0
     # a light that is hidden from every sampled surfel has no samples; dark lights
     # cannot be ingested
     fraction = capture["surfels"].to_dataset()["light_visible_fraction"].values
     reached = np.asarray((fraction[surfels] > 0).any(axis=0))
-    if not surfels.any() or not reached.any():
-        rule = "a fit needs surfels that a camera sees lit"
-        cure = "check calibration, mesh and frames, then ingest again"
-        raise InputError(Fault(f"{name}: samples", rule, "no usable sample", cure))
+    require(
+        surfels.any() and reached.any(),
+        f"{name}: samples",
+        "a fit needs surfels that a camera sees lit",
+        "no usable sample",
+        "check calibration, mesh and frames, then ingest again",
+    )
     candidates = [
         Omission(
             "surfels",
@@ -207,10 +207,13 @@ def _drawn(
 ) -> Index:
     """Indices of the useful lights or cameras that are held out: at least one if any, never all."""
     count = int(useful.sum())
-    if fraction and count < 2:
-        rule = f"to hold out a {dim}, two or more must reach the subject"
-        cure = "hold nothing out"
-        raise InputError(Fault(f"hold_out_{dim}s", rule, str(count), cure))
+    require(
+        not fraction or count >= 2,
+        f"hold_out_{dim}s",
+        f"to hold out a {dim}, two or more must reach the subject",
+        str(count),
+        "hold nothing out",
+    )
     order = np.random.default_rng(seed).permutation(np.flatnonzero(useful))
     if "photographs" in capture.children:
         photographed = np.isin(

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from trimesh.exchange.ply import load_ply
 
-from skindb.errors import Fault, InputError, input_error
+from skindb.errors import Fault, InputError, input_error, require_none
 from skindb.files import open_regular
 from skindb.limits import (
     MAX_PLY_TEXT_LINES,
@@ -95,8 +95,7 @@ def read_scan(path: str | Path) -> Scan:
     except DAMAGE as error:
         rule = "the scan must be a complete mesh file"
         raise _fault(file, rule, _damage(error)) from error
-    if faults := _faults(str(file), scan.vertices, scan.faces):
-        raise InputError(faults)
+    require_none(_faults(str(file), scan.vertices, scan.faces))
     return scan
 
 

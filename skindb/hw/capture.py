@@ -7,7 +7,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from skindb.errors import Fault, InputError, few_names, input_error
+from skindb.errors import Fault, InputError, few_names, input_error, require_none
 from skindb.hw.brightness import failed_lights
 from skindb.hw.cameras import Cameras
 from skindb.hw.capture_folder import (
@@ -255,8 +255,7 @@ def _require_devices(setup: Setup, devices: Devices, plan: CapturePlan) -> None:
         faults.append(
             Fault("probe", rule, "one of them missing", "connect it, or name no sites")
         )
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
 
 
 def _measure_sites(

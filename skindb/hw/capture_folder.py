@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from skindb.calibration.setup import PROBE_FILE, read_setup_dome
-from skindb.errors import Fault, InputError, input_error, require
+from skindb.errors import Fault, InputError, input_error, require, require_none
 from skindb.files import make_private, private_file
 from skindb.format.dome import CameraRecord, DomeRecord
 from skindb.format.fields import Fields, read_json
@@ -124,8 +124,7 @@ def open_unfinished(folder: Path, identity: Mapping[str, Any]) -> Unfinished:
     path = folder / UNFINISHED
     faults = list[Fault]()
     note = read_json(path, faults) if path.is_file() else None
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
     if note is None:
         text = (
             "a complete capture"
@@ -183,8 +182,7 @@ def _require_same(
                     "give the earlier value, or choose another folder",
                 )
             )
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
 
 
 def digest(*records: Any) -> str:
@@ -267,8 +265,7 @@ def read_setup(folder: Path) -> Setup:
         fields = Fields(probe, str(file), faults)
         brackets = read_exposures(fields)
         fields.items("fibres", maximum=MAX_FIBRES)
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
     return Setup(folder, dome, record, probe, brackets)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
-from skindb.errors import Fault, InputError, few_names
+from skindb.errors import Fault, InputError, few_names, require_none
 from skindb.hw.cameras import Cameras
 from skindb.hw.dome import STOPPED, Dome
 from skindb.hw.frame_markers import exposures_problem, identify_frames, with_markers
@@ -360,8 +360,7 @@ def require_complete(run: DomeRun, cameras: Sequence[str]) -> None:
                 "dark frame" if light == DARK else f"light {light}", rule, failure, cure
             )
         )
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
 
 
 def _describe_missing(run: DomeRun, lost: Mapping[int, Sequence[str]]) -> str:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from skindb.errors import Fault, InputError, attempt, input_error, require
+from skindb.errors import Fault, InputError, attempt, input_error, require, require_none
 from skindb.files import read_regular
 from skindb.format.fields import short
 from skindb.limits import MAX_LIGHTS
@@ -83,8 +83,7 @@ def read_lights(path: Path, pictures: Sequence[str] = ()) -> list[Light]:
                 "remove the lines that do not apply",
             )
         )
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
     if not 1 <= len(found) <= MAX_LIGHTS:
         raise _table_fault(
             path, f"must have 1 to {MAX_LIGHTS:,} lights", f"{len(found)} lights"

@@ -22,7 +22,7 @@ from skindb.calibration.radiance import (
     read_view,
     vignette_gain,
 )
-from skindb.errors import Fault, InputError, attempt, require
+from skindb.errors import Fault, InputError, attempt, require, require_none
 from skindb.format.dome import CameraRecord, DomeRecord
 from skindb.format.frames import Digests
 from skindb.geometry._mesh_kernels import grown
@@ -269,8 +269,7 @@ class Sampler:
         frames = read_view(dome, light.id, merger.camera, digests=digests)
         # wrong dark frames may be why the view is faulty
         self._patterns.add(j, c, frames)
-        if faults := view_faults(dome, light.id, merger, frames):
-            raise InputError(faults)
+        require_none(view_faults(dome, light.id, merger, frames))
         surfels = shot.surfels & self.lit[:, j]
         whole = picture or (j, c) in self.kept
         height, width, _ = frames[0].shape

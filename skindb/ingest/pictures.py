@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from skindb.calibration.lights import ball_outline, distant_light, highlight_centre
-from skindb.errors import Fault, InputError, attempt, few_names, require
+from skindb.errors import Fault, attempt, few_names, require, require_none
 from skindb.files import make_private, private_file, read_regular
 from skindb.format.dome import EXPOSURE_RATIO
 from skindb.format.fields import IDENTIFIER, Fields, short
@@ -221,8 +221,7 @@ def _parameters(
         for name in foreign
         if (value := getattr(chosen, name)) is not None
     ]
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
     return chosen
 
 
@@ -296,8 +295,7 @@ class _Frames:
         faults = list[Fault]()
         fields = Fields({"response": file.name}, str(file.parent), faults)
         read_response(file.parent, fields, (0, count - 1))
-        if faults:
-            raise InputError(faults)
+        require_none(faults)
         return file.read_text(encoding="utf-8")
 
     def add(
@@ -369,8 +367,7 @@ class _Frames:
         scan: Path | None = None,
     ) -> None:
         """Write the other files, capture.json last."""
-        if self.faults:
-            raise InputError(self.faults)
+        require_none(self.faults)
         low, high = (f(self.exposures, default=0.0) for f in (min, max))
         same = high <= EXPOSURE_RATIO * low
         require(
@@ -496,8 +493,7 @@ def _matched(source: Path, files: Sequence[Path], table: Sequence[Light]) -> lis
             faults.append(Fault(str(source), rule, f"{short(file.name)} twice", cure))
         else:
             pairs.append(file)
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
     require(
         len(pairs) >= MIN_LIGHTS,
         str(source),
@@ -709,8 +705,7 @@ def _record(person: Mapping[str, Any], time: datetime) -> dict[str, Any]:
 
 def _require_writable(out: Path, person: Mapping[str, Any]) -> None:
     """Require a record without faults, and a folder that does not exist."""
-    if faults := record_faults(_record(person, datetime.now(UTC))):
-        raise InputError(faults)
+    require_none(record_faults(_record(person, datetime.now(UTC))))
     require(
         not out.exists() or (out.is_dir() and not any(out.iterdir())),
         str(out),

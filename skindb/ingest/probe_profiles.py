@@ -13,7 +13,7 @@ import numpy as np
 from scipy import stats
 
 from skindb.calibration.fibres import place_text, placement_signal
-from skindb.errors import Fault, InputError, attempt, input_error, require
+from skindb.errors import Fault, InputError, attempt, input_error, require, require_none
 from skindb.format.contact_probe import ProbeRecord
 from skindb.format.fields import MAX_MAGNITUDE
 from skindb.format.frames import Digests
@@ -122,8 +122,7 @@ def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profil
         (np.stack([x for x, _ in site]), np.stack([x for _, x in site]))
         for site in by_site
     ]
-    if faults := _light_faults(probe, signals):
-        raise InputError(faults)
+    require_none(_light_faults(probe, signals))
     factor = (probe.scale or 1.0) / probe.gain
     combined = [combine_placements(value, error) for value, error in signals]
     mean, noise, spread = (np.array(part) for part in zip(*combined, strict=True))

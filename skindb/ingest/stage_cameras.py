@@ -8,7 +8,7 @@ from typing import Any
 
 from scipy.spatial.transform import Rotation
 
-from skindb.errors import Fault, InputError, input_error, require
+from skindb.errors import Fault, InputError, input_error, require, require_none
 from skindb.files import read_regular
 from skindb.format.fields import Fields, read_json, short
 from skindb.ingest.light_tables import numbers
@@ -35,8 +35,7 @@ def read_cameras(source: Path, given: Path | None) -> list[dict[str, Any]]:
         for key in ("width", "height"):
             if item.has(key):
                 item.integer(key, minimum=1)
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
     keys = ("id", "width", "height", "K", "R", "t", "distortion")
     return [
         {key: item[key] for key in keys if key in item}

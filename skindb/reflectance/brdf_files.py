@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
-from skindb.errors import Fault, InputError, input_error, require
+from skindb.errors import Fault, InputError, input_error, require, require_none
 from skindb.files import private_file
 from skindb.optics.angles import half_difference
 from skindb.reflectance.dictionary import (
@@ -362,8 +362,7 @@ def read_merl_folder(path: str | Path) -> Dictionary:
         else:
             tables.append(table)
             origins.append(origin)
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
     names = tuple(file.stem for file in files)
     return Dictionary(
         names,

@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import TypeVar
 
-from skindb.errors import Fault, InputError, attempt, input_error, require
+from skindb.errors import Fault, attempt, input_error, require, require_none
 from skindb.store.bucket import place_at
 from skindb.store.erasure import remainder_of
 from skindb.store.lease import Lease
@@ -134,8 +134,7 @@ class Archive:
                 "give the folder of skindb backup",
             )
         faults = marker_faults(self.place)
-        if faults:
-            raise InputError(faults)
+        require_none(faults)
 
     def require_of(self, place: Place) -> None:
         """Raise an `InputError` unless it is a backup of this database."""
@@ -317,8 +316,7 @@ def backup_states(url: str) -> list[State]:
     archive = Archive(place_at(url))
     archive.require()
     states, faults = archive.states()
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
     return states
 
 

@@ -16,7 +16,7 @@ from typing import TypeVar
 
 from skindb import __version__
 from skindb.clock import utc_time
-from skindb.errors import Fault, InputError, input_error
+from skindb.errors import Fault, input_error, require_none
 from skindb.schema.consent import CONSENT
 from skindb.store.archive import (
     RECORD_KEY,
@@ -166,8 +166,7 @@ def _begin(place: Place, archive: Archive) -> None:
             place.name, "must be a database", finding, "give the folder of a database"
         )
     faults = marker_faults(place)
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
     dest = archive.place
     require_apart(dest, place)
     if not dest.file_type(f"{WITHDRAWN}/{BACKUP}"):
@@ -192,8 +191,7 @@ def _erase(place: Place, archive: Archive, lease: Lease) -> int:
     markers = archive.adopt(place)
     contents = archive.contents()
     states, faults = _erased_states(archive, markers)
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
     return archive.prune(contents, _needed(archive, states), lease)
 
 

@@ -7,7 +7,7 @@ A subject may be withdrawn, or change the consent, while the version is computed
 from collections.abc import Iterable
 from functools import partial
 
-from skindb.errors import Fault, InputError, require
+from skindb.errors import Fault, require, require_none
 from skindb.files import Attributes
 from skindb.schema.consent import CONSENT, consent_scope
 from skindb.store.log import Log
@@ -60,8 +60,7 @@ def require_inputs(place: Place, provenance: Attributes) -> list[Record]:
             if is_shared and _record_of(place, product) is None:
                 finding = f"{_name(product)} was removed"
                 faults.append(Fault(title, rule, finding, "run skindb refresh"))
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
     return records
 
 
@@ -129,8 +128,7 @@ def require_consents(
                     "nothing was committed; see skindb consent",
                 )
             )
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
 
 
 def _record_of(place: Place, reference: Attributes) -> Record | None:

@@ -17,7 +17,7 @@ from dataclasses import replace
 from functools import partial
 
 from skindb.clock import utc_time
-from skindb.errors import Fault, InputError, attempt, input_error
+from skindb.errors import Fault, InputError, attempt, input_error, require_none
 from skindb.files import Json
 from skindb.store.markers import WithdrawnError
 from skindb.store.place import (
@@ -73,8 +73,7 @@ class Log:
         # read before the log, which only grows
         head = self.head() if generation is None else {}
         listed = self.generations()
-        if lost := self._head_faults(head, listed):
-            raise InputError(lost)
+        require_none(self._head_faults(head, listed))
         if not listed or (generation is not None and generation not in listed):
             rule = (
                 "the database must hold it"
@@ -86,8 +85,7 @@ class Log:
                 f"{self.place.name}: {self.what}", rule, finding, "see skindb info"
             )
         record = self._read(listed[-1] if generation is None else generation)
-        if exchanged := self._head_faults(head, listed, [record]):
-            raise InputError(exchanged)
+        require_none(self._head_faults(head, listed, [record]))
         return record
 
     def is_empty(self) -> bool:

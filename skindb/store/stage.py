@@ -18,7 +18,14 @@ from xarray import DataArray, Dataset, Variable
 from zarr.codecs import BloscCodec
 
 from skindb import __version__
-from skindb.errors import Fault, InputError, UnavailableError, add_filename, require
+from skindb.errors import (
+    Fault,
+    InputError,
+    UnavailableError,
+    add_filename,
+    require,
+    require_none,
+)
 from skindb.files import Attributes, Json, plain
 from skindb.schema import SCHEMA_VERSION, VARIABLES, check, dataset
 from skindb.schema.label import BLOCK_SURFELS
@@ -159,8 +166,7 @@ class Stage:
         self._require_open()
         datasets = dict(groups) | ({} if tables is None else {TABLES: tables})
         faults = [fault for name, ds in datasets.items() for fault in _faults(name, ds)]
-        if faults:
-            raise InputError(faults)
+        require_none(faults)
         labels = {
             str(take)
             for ds in datasets.values()

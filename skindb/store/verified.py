@@ -21,7 +21,7 @@ from zarr.abc.store import (
 )
 from zarr.core.buffer import Buffer, BufferPrototype
 
-from skindb.errors import Fault, InputError, input_error, require
+from skindb.errors import Fault, InputError, input_error, require, require_none
 from skindb.store.place import BLOCK_BYTES, Digests, Place, block_digests
 from skindb.store.record import Record, json_object
 
@@ -245,8 +245,7 @@ class VerifiedStore(ListedStore):
         for key, file in self.files.items():
             if finding := size_difference(sizes.get(key), file):
                 faults += self._fault(key, finding).faults
-        if faults:
-            raise InputError(faults)
+        require_none(faults)
 
     def _fault(self, key: str, finding: str) -> InputError:
         return input_error(
