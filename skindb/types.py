@@ -58,6 +58,11 @@ def float64(values: ArrayLike) -> Float64:
     return np.asarray(values, np.float64)
 
 
+def contiguous(values: ArrayLike) -> Float64:
+    """An array in double precision and C order, for which kernels are compiled."""
+    return np.ascontiguousarray(values, np.float64)
+
+
 def finite_rows(values: AnyArray) -> Mask:
     """Mask (...) of the rows of an array (..., d) whose values are all finite."""
     return np.asarray(np.isfinite(values).all(axis=-1))

@@ -11,7 +11,7 @@ from skindb.fit.lumitexels import GEOMETRY
 from skindb.jit import sample_bits
 from skindb.parameters import SCAN_ERROR_DEGREES
 from skindb.schema import check
-from skindb.types import Array
+from skindb.types import Array, contiguous
 
 
 def estimate_normals(
@@ -79,7 +79,7 @@ def surfel_normals(
     chosen = np.empty((n, 3))
     error, total = np.empty((2, n))
     position, light, camera, scan = (
-        np.ascontiguousarray(a, np.float64) for a in (position, light, camera, scan)
+        contiguous(a) for a in (position, light, camera, scan)
     )
     normals_block(
         sample_bits(sample),

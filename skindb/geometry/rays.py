@@ -15,6 +15,7 @@ from skindb.types import (
     Index,
     Index32,
     Mask,
+    contiguous,
     dots,
     finite_rows,
     float64,
@@ -78,12 +79,12 @@ class RayScene:
         ndarray
             (n,) or (m,) bool. Origins or targets that are not finite count as hidden.
         """
-        begin = np.ascontiguousarray(origin, np.float64)
-        end = np.ascontiguousarray(target, np.float64)
+        begin = contiguous(origin)
+        end = contiguous(target)
         lift = np.zeros((1, 3))
         ahead = RAY_OFFSET_MM
         if normal is not None:
-            lift = np.ascontiguousarray(normal, np.float64)
+            lift = contiguous(normal)
             ahead = 0.0
         if chosen is None:
             chosen = np.arange(np.broadcast_shapes(begin.shape, end.shape)[0])

@@ -23,7 +23,7 @@ from skindb.ingest._sample_kernels import (
     shift_moments,
 )
 from skindb.numerics.statistics import correlation, robust_deviation
-from skindb.types import Array, Float32, Float64, Mask, float64
+from skindb.types import Array, Float32, Float64, Mask, contiguous, float64
 
 PIXEL_MM = 2.0  # mm; about the width of an eyelid, well below the offsets to be found
 SMOOTHING_PX = 0.7  # px of the downsampled picture; makes its derivatives smooth
@@ -117,8 +117,8 @@ def interpolated(images: Float64, pixels: Float64) -> Float64:
     """
     out = np.empty((len(pixels), images.shape[2]))
     interpolate(
-        np.ascontiguousarray(images, np.float64),
-        np.ascontiguousarray(pixels, np.float64),
+        contiguous(images),
+        contiguous(pixels),
         out,
     )
     return out

@@ -22,7 +22,7 @@ from skindb.reflectance.model import (
 )
 from skindb.reflectance.tables import Table
 from skindb.schema import variables
-from skindb.types import Array, Float32, float64
+from skindb.types import Array, Float32, contiguous, float64
 
 MODES = ("linear", "perceptual")  # in the order of `_lumitexel_kernels`
 # that any model has after a first pass, in the order of `SurfaceFit` after its parameters
@@ -42,7 +42,7 @@ NO_TABLE = np.zeros((2, 2, 1, 0), np.float32)
 def kernel_block(block: Block) -> Block:
     """The block in the types for which the kernels are compiled."""
     doubles: dict[str, Any] = {
-        name: np.ascontiguousarray(getattr(block, name), np.float64)
+        name: contiguous(getattr(block, name))
         for name in ("position", "light", "camera", "normal", "diffuse", "polarisation")
     }
     return block._replace(sample=sample_bits(block.sample), **doubles)
@@ -146,15 +146,15 @@ def shade_tables(points: Points, table: Table, lamp: Lamp, *, eta: float) -> Flo
     """Radiance (n, 3) of the diffuse term and of mixtures of tables (nh, nd, np, k)."""
     out = np.empty((len(points.position), 3), np.float32)
     _shade_kernels.shade(
-        np.ascontiguousarray(points.position, np.float64),
-        np.ascontiguousarray(points.normal, np.float64),
-        np.ascontiguousarray(points.view, np.float64),
+        contiguous(points.position),
+        contiguous(points.normal),
+        contiguous(points.view),
         np.ascontiguousarray(points.diffuse, np.float32),
         np.ascontiguousarray(points.parameters, np.float32),
         np.ascontiguousarray(table, np.float32),
-        np.ascontiguousarray(lamp.place, np.float64),
+        contiguous(lamp.place),
         np.ascontiguousarray(lamp.lit, np.float32),
-        np.ascontiguousarray(lamp.axis, np.float64),
+        contiguous(lamp.axis),
         float(lamp.falloff),
         float(eta),
         points.parameters.shape[1] > 0,

@@ -21,7 +21,7 @@ from skindb.reflectance._lumitexel_kernels import MIN_SAMPLES_GLOSS
 from skindb.reflectance.block import kernel_block, kernel_options
 from skindb.reflectance.lobes import GRADED_ROUGHNESS, SURFACE_INDEX
 from skindb.reflectance.model import Block, Comparison
-from skindb.types import Array
+from skindb.types import Array, contiguous
 
 __all__ = ["UNKNOWN_GLOSS", "Gloss", "JointFit", "refine_block"]
 
@@ -115,7 +115,7 @@ def refine_block(
         gloss.spread,
         gloss.samples,
         SURFACE_INDEX,
-        np.ascontiguousarray(scan_normal, np.float64),
+        contiguous(scan_normal),
         float(scan_error),
         *(STEPS if scan_error < MAX_SCAN_ERROR else STEPS_WITHOUT_SCAN),
     )

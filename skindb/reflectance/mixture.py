@@ -58,6 +58,7 @@ from skindb.types import (
     Index,
     Index32,
     Mask,
+    contiguous,
     float64,
 )
 
@@ -113,7 +114,7 @@ class Mixture:
         if rank != lift.shape[1]:
             scale = np.full(lift.shape[1], scale[0])
         object.__setattr__(self, "filled", _read_only(pad_to_lanes(table)))
-        matrix = np.ascontiguousarray(lift, np.float64)
+        matrix = contiguous(lift)
         object.__setattr__(self, "matrix", _read_only(matrix))
         object.__setattr__(self, "scale", scale)
         if not self.names:
@@ -371,9 +372,7 @@ def basis_rows(
         raise ValueError(
             f"the table must have the shape of the grid {grid}, found {table.shape}"
         )
-    normal, to_light, to_camera = (
-        np.ascontiguousarray(a, np.float64) for a in (normal, to_light, to_camera)
-    )
+    normal, to_light, to_camera = (contiguous(a) for a in (normal, to_light, to_camera))
     lit = _above_horizon(normal, to_light)
     seen = _above_horizon(normal, to_camera)
     use = np.ascontiguousarray(usable & lit[:, :, None] & seen[:, None, :])
