@@ -100,6 +100,14 @@ class State:
         """Key of its file."""
         return f"{STATES}/{self.number:06d}.json"
 
+    def items(self, top: str = "") -> list[Item]:
+        """Its small files whose keys begin with `top`, ascending."""
+        return [
+            (key, digest, None)
+            for key, digest in sorted(self.files.items())
+            if key.startswith(top)
+        ]
+
     def content(self) -> bytes:
         """Content of its file."""
         body = asdict(self) | {"format": FORMAT}
@@ -133,8 +141,7 @@ class Archive:
                 finding,
                 "give the folder of skindb backup",
             )
-        faults = marker_faults(self.place)
-        require_none(faults)
+        require_none(marker_faults(self.place))
 
     def require_of(self, place: Place) -> None:
         """Raise an `InputError` unless it is a backup of this database."""
@@ -240,23 +247,13 @@ class Archive:
         """The records of a state by their keys, ascending; faults of others are added
         to `faults`.
         """
-        items = [
-            (key, digest, None)
-            for key, digest in sorted(state.files.items())
-            if key.startswith("log/")
-        ]
-        return {
-            key: record for (key, _, _), record in intact(self._record, items, faults)
-        }
+        read = intact(self._record, state.items("log/"), faults)
+        return {key: record for (key, _, _), record in read}
 
     def requests(self, state: State, faults: list[Fault]) -> list[Request]:
         """The requests of a state; faults of others are added to `faults`."""
-        items = [
-            (key, digest, None)
-            for key, digest in state.files.items()
-            if key.startswith(f"{REQUESTS}/")
-        ]
-        read = intact(partial(self.parsed, request_from_json), items, faults)
+        parse = partial(self.parsed, request_from_json)
+        read = intact(parse, state.items(f"{REQUESTS}/"), faults)
         return [request for _, request in read]
 
     def version_items(self, record: Record) -> list[Item]:
@@ -281,7 +278,7 @@ class Archive:
             record for key, record in records.items() if state.files[key] not in seen
         ]
         seen |= {state.files[key] for key in records}
-        items: list[Item] = [(key, digest, None) for key, digest in state.files.items()]
+        items = state.items()
         for _, those in intact(self.version_items, fresh, faults):
             items += those
         return items

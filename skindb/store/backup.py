@@ -16,7 +16,7 @@ from typing import TypeVar
 
 from skindb import __version__
 from skindb.clock import utc_time
-from skindb.errors import Fault, input_error, require_none
+from skindb.errors import Fault, input_error, require, require_none
 from skindb.schema.consent import CONSENT
 from skindb.store.archive import (
     RECORD_KEY,
@@ -165,8 +165,7 @@ def _begin(place: Place, archive: Archive) -> None:
         raise input_error(
             place.name, "must be a database", finding, "give the folder of a database"
         )
-    faults = marker_faults(place)
-    require_none(faults)
+    require_none(marker_faults(place))
     dest = archive.place
     require_apart(dest, place)
     if not dest.file_type(f"{WITHDRAWN}/{BACKUP}"):
@@ -175,13 +174,13 @@ def _begin(place: Place, archive: Archive) -> None:
             for name in dest.names() or []
             if name not in ("staging", SECRET, WITHDRAWN)
         ]
-        if foreign:
-            raise input_error(
-                dest.name,
-                "a backup needs an empty folder, or one with a backup",
-                f"other files, such as {foreign[0]}",
-                "give another folder",
-            )
+        require(
+            not foreign,
+            dest.name,
+            "a backup needs an empty folder, or one with a backup",
+            f"other files, such as {', '.join(foreign[:1])}",
+            "give another folder",
+        )
         dest.create(SECRET, place.read_small(SECRET))
         dest.create(f"{WITHDRAWN}/{BACKUP}", b"{}")
     archive.require()
