@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from skindb.files import cache_folder, make_private, private_file
+from skindb.files import cache_folder, file_digest, make_private, private_file
 from skindb.threads import one_blas_thread
 from skindb.types import AnyArray
 
@@ -78,7 +78,9 @@ def _read(place: Path) -> Arrays | None:
     """The arrays of an entry; None if it is missing or damaged."""
     try:
         sums = json.loads((place / SUMS).read_text(encoding="utf-8"))
-        if any(_digest(place / f"{key}.npy") != digest for key, digest in sums.items()):
+        if any(
+            file_digest(place / f"{key}.npy") != digest for key, digest in sums.items()
+        ):
             return None
         return {
             key: np.asarray(np.load(place / f"{key}.npy", mmap_mode="r"))
@@ -95,7 +97,7 @@ def _write(place: Path, arrays: Arrays) -> None:
         make_private(staged)
         for key, array in arrays.items():
             np.save(private_file(staged / f"{key}.npy"), array)
-        sums = {key: _digest(staged / f"{key}.npy") for key in arrays}
+        sums = {key: file_digest(staged / f"{key}.npy") for key in arrays}
         private_file(staged / SUMS).write_text(json.dumps(sums), encoding="utf-8")
         shutil.rmtree(place, ignore_errors=True)  # a damaged entry
         staged.rename(place)
@@ -107,8 +109,3 @@ def _remove_oldest(folder: Path, name: str) -> None:
     entries = sorted(folder.glob(f"{name}-*"), key=lambda place: place.stat().st_mtime)
     for place in entries[:-MAX_ENTRIES]:
         shutil.rmtree(place, ignore_errors=True)
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

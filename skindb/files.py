@@ -87,6 +87,12 @@ def read_regular(path: Path, max_bytes: int) -> bytes:
             raise _not_opened(path, error) from None
 
 
+def file_digest(path: Path) -> str:
+    """SHA-256 of the content of a file."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
 def json_depth(text: str) -> int:
     """Largest depth of nested brackets, computed before parsing, which needs stack and
     memory in proportion.

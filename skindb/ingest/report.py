@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from skindb.files import file_digest
 from skindb.format.dome import DomeRecord
 from skindb.format.folder import WHOLE_SURFACE, Capture
 from skindb.format.frames import Digests
@@ -35,7 +36,7 @@ def capture_provenance(
     from them in the order of their paths, as the frames are decoded in any order.
     """
     inputs = {
-        file.relative_to(capture.folder).as_posix(): _sha256(file)
+        file.relative_to(capture.folder).as_posix(): file_digest(file)
         for file in _files(capture)
     }
     dome = capture.dome
@@ -46,7 +47,7 @@ def capture_provenance(
         files.update(capture.probe.frame_files())
     frames = sorted(files)
     if frames:
-        frame_digests = [digests.get(path) or _sha256(path) for path in frames]
+        frame_digests = [digests.get(path) or file_digest(path) for path in frames]
         inputs[FRAMES] = hashlib.sha256("".join(frame_digests).encode()).hexdigest()
     crop = {} if capture.crop is None else {"crop": asdict(capture.crop)}
     by = capture.calibrated_by
@@ -88,11 +89,6 @@ def _files(capture: Capture) -> list[Path]:
     tables = {camera.sensor.response_file for camera in cameras}
     files = {capture.mesh_file, *tables}
     return [*capture.json_files, *sorted(file for file in files if file is not None)]
-
-
-def _sha256(file: Path) -> str:
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def cleaning_lines(provenance: Mapping[str, Any], *, places: bool) -> list[str]:

@@ -4,7 +4,6 @@ al. 2003). Their values are resampled to the default grid.
 
 from __future__ import annotations
 
-import hashlib
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
 from skindb.errors import Fault, InputError, input_error, require, require_none
-from skindb.files import private_file
+from skindb.files import file_digest, private_file
 from skindb.optics.angles import half_difference
 from skindb.reflectance.dictionary import (
     Dictionary,
@@ -78,7 +77,7 @@ def read_tables(path: str | Path) -> Dictionary:
         raise InputError([Fault(f"{path}[{name}]", *fault) for name, *fault in faults])
     brdf = arrays[TABLE]
     nodes = (arrays["theta_h"], arrays["theta_d"], arrays["phi_d"])
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    digest = file_digest(path)
     resampled = [
         to_default_grid(_channel_mean(brdf_of_material), nodes, digest)
         for brdf_of_material in brdf
@@ -355,7 +354,7 @@ def read_merl_folder(path: str | Path) -> Dictionary:
     for file in files:
         try:
             brdf = read_merl(file)[0].mean(axis=-1)
-            digest = hashlib.sha256(file.read_bytes()).hexdigest()
+            digest = file_digest(file)
             table, origin = to_default_grid(brdf, nodes, digest)
         except InputError as error:
             faults.extend(error.faults)
