@@ -44,7 +44,8 @@ CELLS = 8  # a picture is compared by its means in CELLS x CELLS parts
 # difference between pictures of the marker light in the same state, relative to that
 # between on and off: noise and a subject that breathes stay far below it
 MAX_DIFFERENCE = 0.1
-# the same for pictures of two lights, below which they are two pictures of one
+# difference between pictures of two lights, relative to how bright they are, below which
+# they are two pictures of one
 MIN_DIFFERENCE = 0.01
 
 
@@ -260,10 +261,11 @@ def _alike(shots: Sequence[Shot], means: Float64, names: Sequence[str]) -> str:
     """Neighbours that look like one light that was photographed twice, in frames that
     begin with a marker and have the means (n, CELLS^2).
     """
-    contrast = np.linalg.norm(means[0] - means[1])
-    is_lit = np.linalg.norm(means - means[1], axis=1) > MAX_DIFFERENCE * contrast
+    level = np.linalg.norm(means - means[1], axis=1)
     step = np.linalg.norm(np.diff(means, axis=0), axis=1)
-    equal = (step < MIN_DIFFERENCE * contrast) & is_lit[1:]
+    equal = (step < MIN_DIFFERENCE * level[1:]) & (
+        level[1:] > MAX_DIFFERENCE * level[0]
+    )
     for i in np.flatnonzero(equal).tolist():
         if names[i] != names[i + 1]:
             files = (shots[i].path.name, shots[i + 1].path.name)
