@@ -15,7 +15,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Self, Union, get_args, get_origin, get_type_hints
 
-from skindb.errors import Fault, InputError, input_error
+from skindb.errors import Fault, input_error, require_none
 from skindb.limits import (
     MAX_CAMERAS,
     MAX_DEMO_TAKES,
@@ -160,8 +160,7 @@ def require_limits(parameters: Any) -> None:
         rule = broken_rule(option_of(record, spec.name), hints[spec.name], value)
         if rule:
             faults.append(Fault(spec.name, rule, repr(value), "give another value"))
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
 
 
 def broken_rule(limits: Option, hint: Any, value: Any) -> str:
@@ -290,8 +289,7 @@ class FitParameters(Limited):
             for spec in fields(self)
             if spec.name in ("k", "rank") and getattr(self, spec.name) != spec.default
         ]
-        if faults:
-            raise InputError(faults)
+        require_none(faults)
 
     @classmethod
     def of(cls, attrs: Mapping[Any, Any]) -> Self:

@@ -12,7 +12,7 @@ from scipy import ndimage, optimize
 from skindb.calibration.frame_checks import compared_exposures, disagreement
 from skindb.calibration.radiance import Image, merge_exposures
 from skindb.calibration.setup import of_devices
-from skindb.errors import Fault, InputError, attempt, require
+from skindb.errors import Fault, InputError, attempt, require, require_none
 from skindb.format.contact_probe import ProbeRecord
 from skindb.format.frames import Digests, Frame, read_frame, read_frames
 from skindb.limits import MAX_FIBRE_PIXELS
@@ -131,8 +131,7 @@ def fibre_pixels(probe: ProbeRecord, shape: tuple[int, ...]) -> list[Index]:
         for i, pixels in enumerate(fibres)
         if not len(pixels)
     ]
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
     return fibres
 
 

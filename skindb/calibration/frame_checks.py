@@ -18,7 +18,7 @@ from skindb.calibration.radiance import (
     read_view,
     relative_exposure,
 )
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, require_none
 from skindb.format.dome import DomeRecord
 from skindb.format.fields import MAX_MAGNITUDE
 from skindb.format.frames import Digests, Frame, read_frame
@@ -133,8 +133,7 @@ def checked_white_view(
         With every frame that cannot be decoded, or the fault of the view.
     """
     frames = read_view(dome, light, merger.camera, white=True, digests=digests)
-    if faults := view_faults(dome, light, merger, frames, white=True):
-        raise InputError(faults)
+    require_none(view_faults(dome, light, merger, frames, white=True))
     return frames
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from skindb.errors import Fault, InputError, attempt, require
+from skindb.errors import Fault, InputError, attempt, require, require_none
 from skindb.format.contact_probe import ProbeRecord, read_probe
 from skindb.format.dome import CameraRecord, DomeRecord, read_dome
 from skindb.format.fields import Fields, read_json, shown
@@ -79,8 +79,7 @@ def read_setup_dome(
             "none",
             "photograph it, see docs/capture_format.md",
         )
-    if fields.faults:
-        raise InputError(fields.faults)
+    require_none(fields.faults)
     return dome
 
 
@@ -222,8 +221,7 @@ def read_calibration_frames(dome: DomeRecord) -> CalibrationFrames | None:
         "its keys are exposures, dark, response, flat, chart, points and ball",
         "correct the name, or remove the key",
     )
-    if fields.faults:
-        raise InputError(fields.faults)
+    require_none(fields.faults)
     return CalibrationFrames(dome.folder, exposures, kinds, points, ball)
 
 
@@ -363,6 +361,5 @@ def read_flat_frames(folder: Path) -> ProbeRecord | None:
         "frames": template.replace(f"{{{REPEAT}}}", f"{{{SITE}}}"),
     }
     flat = read_probe(folder, probe)
-    if probe.faults:
-        raise InputError(probe.faults)
+    require_none(probe.faults)
     return flat

@@ -27,7 +27,7 @@ import OpenEXR
 import tifffile
 
 from skindb.elementwise import thread_count
-from skindb.errors import Fault, InputError, attempt, input_error, require
+from skindb.errors import Fault, InputError, attempt, input_error, require, require_none
 from skindb.files import open_regular, private_file, read_regular
 from skindb.format._frame_kernels import undo_filters, unpack_lines
 from skindb.format.fields import IDENTIFIER, Fields, short
@@ -241,8 +241,7 @@ def read_frames(
     frames = [
         attempt(faults, partial(read_frame, path, kind, digests)) for path in paths
     ]
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
     return [frame for frame in frames if frame is not None]
 
 

@@ -20,7 +20,7 @@ from skindb.geometry.mesh import (
     winding_number,
 )
 from skindb.geometry.scan import Crop, Scan
-from skindb.types import Float64
+from skindb.types import Float64, lengths
 
 UNITS = {
     "metres": 1000.0,
@@ -239,7 +239,7 @@ def swapped_faults(
     if length == 0:
         return []
     across = np.array([points[left] - points[right] for left, right in pairs])
-    limit = -MIN_COSINE_SIDEWAYS * np.linalg.norm(across, axis=1)
+    limit = -MIN_COSINE_SIDEWAYS * lengths(across)
     wrong = across @ (axis / length) < limit
     rule = (
         "left must be the subject's left: +x of a face that looks along +z, with y up"
@@ -360,7 +360,7 @@ def device_faults(where: str, dome: DomeRecord, surface: CleanMesh) -> list[Faul
 def _dome_rescaling(positions: Sequence[Float64] | Float64, diagonal: float) -> str:
     """The correction for positions of cameras or lights around a scan of this diagonal [mm]."""
     # the origin is near the centre of the dome
-    distance = float(np.median(np.linalg.norm(positions, axis=1)))
+    distance = float(np.median(lengths(positions)))
     return rescaling(likely_unit(distance, DOME_RADIUS_RATIO * diagonal))
 
 
@@ -474,7 +474,7 @@ def _shrunken_head(surface: CleanMesh, diagonal: float) -> bool:
     """
     unit = UNITS[likely_unit(diagonal, HEAD_DIAGONAL)]
     cross = face_crosses(surface.vertices, surface.faces)
-    facing = np.linalg.norm(cross.sum(axis=0)) / np.linalg.norm(cross, axis=1).sum()
+    facing = np.linalg.norm(cross.sum(axis=0)) / lengths(cross).sum()
     away = np.linalg.norm(surface.vertices.mean(axis=0))
     return bool(
         unit > 1

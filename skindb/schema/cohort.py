@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from xarray import Dataset, Variable
 
-from skindb.errors import Fault, InputError, few_names, require
+from skindb.errors import Fault, InputError, few_names, require, require_none
 from skindb.schema.label import label, text_labels
 from skindb.schema.notes import note
 from skindb.schema.variables import VARIABLES
@@ -335,8 +335,7 @@ def require_same_fit(cohort: Dataset) -> None:
             finding = "; ".join(f"{v} of {few_names(of)}" for v, of in groups.items())
             cure = "refit them alike, or name the takes that the study is to use"
             faults.append(Fault(f"parameter {name}", rule, finding, cure))
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
 
 
 def _all_labels(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from xarray import Dataset, Variable
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, require_none
 from skindb.schema.declaration import flag_attrs
 from skindb.schema.variables import VARIABLES
 
@@ -84,8 +84,7 @@ def check(ds: Dataset, names: Iterable[str], *, where: str = "dataset") -> None:
         What the user knows this Dataset by.
     """
     faults = [fault for name in names for fault in _faults(ds, name, where)]
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
 
 
 def _faults(ds: Dataset, name: str, where: str) -> list[Fault]:
