@@ -199,14 +199,17 @@ def main(
     both = [measurements(part.isel(take=normal)) for part in (cohort, planted)]
     for estimated, truth in zip(*both, strict=True):
         name = estimated.quantity.name
-        everywhere = np.ones(estimated.values.shape[1:], bool)
-        print(f"| {name} | {compared(estimated, truth, everywhere)} | {false[name]} |")
+        known = np.isfinite(estimated.values).any(axis=0)
+        print(f"| {name} | {compared(estimated, truth, known)} | {false[name]} |")
     for estimated, truth in zip(*both, strict=True):
         if estimated.quantity.name in BY_REGION:
             print(f"\n| {estimated.quantity.name} | {HEADER}")
-            regions = np.array(estimated.labels[0])
-            for region in regions:
-                print(f"| {region} | {compared(estimated, truth, regions == region)} |")
+            known = np.isfinite(estimated.values).any(axis=0)
+            for i in np.flatnonzero(known.reshape(len(known), -1).any(axis=1)):
+                places = np.zeros_like(known)
+                places[i] = known[i]
+                region = estimated.labels[0][i]
+                print(f"| {region} | {compared(estimated, truth, places)} |")
     options = {"group_by": group_by, "adjust": adjust, "quantities": NAMES}
     estimated, want = (
         group_effects(part, permutations=1000, rng=np.random.default_rng(0), **options)
