@@ -449,7 +449,7 @@ def _solve(
     effects of the first groups, of the other ones, and of the residual.
     """
     if not groups:
-        estimate = np.linalg.lstsq(x, y, rcond=None)[0]
+        estimate = np.linalg.lstsq(x, y)[0]
         rest = y - x @ estimate
         variance = float((rest**2).sum()) / (len(y) - x.shape[1])
         inverse = np.linalg.inv(x.T @ x)

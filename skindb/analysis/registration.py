@@ -216,7 +216,7 @@ def _sheet(model: DataTree, names: Sequence[str]) -> Sheet:
 
 def _landmarks(model: DataTree) -> tuple[tuple[str, ...], Float64]:
     """Names of the landmarks of a take, and their positions (k, 3) [mm]."""
-    points = model["mesh"].to_dataset()[variables.LANDMARK_POSITION]
+    points = model["mesh"].dataset[variables.LANDMARK_POSITION]
     return tuple(map(str, points["landmark"].values)), float64(points.values)
 
 
@@ -414,7 +414,7 @@ def surface_of(
 ) -> tuple[Float64, Float64, Index]:
     """Positions (n, 3) in mm, texture coordinates (n, 2) and triangles (f, 3) of a take."""
     fitted = model["fitted"].to_dataset()
-    faces = model["mesh"].to_dataset()[variables.TRIANGLE].values
+    faces = model["mesh"].dataset[variables.TRIANGLE].values
     position, uv = (
         fitted[name].values.astype(float)
         for name in (variables.SURFEL_POSITION, variables.SURFEL_UV)

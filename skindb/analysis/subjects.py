@@ -497,7 +497,7 @@ def multiple_correlation(y: Array, columns: Array) -> float:
     free = len(y) - np.linalg.matrix_rank(x) if len(y) else 0
     if free < 1 or np.ptp(y) == 0:
         return float("nan")
-    residual = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
+    residual = y - x @ np.linalg.lstsq(x, y)[0]
     return float(
         np.sqrt(max(0.0, 1.0 - (residual @ residual / free) / np.var(y, ddof=1)))
     )

@@ -136,7 +136,7 @@ def _least_squares(camera: Float64, target: Float64) -> tuple[Float64, Float64]:
     """Matrix (3, 3) that takes camera values (n, 3) to colours (n, 3), and its standard
     error.
     """
-    solution, *_ = np.linalg.lstsq(camera, target, rcond=None)
+    solution, *_ = np.linalg.lstsq(camera, target)
     residual = target - camera @ solution
     variance = (residual**2).sum(axis=0) / max(len(camera) - 3, 1)
     error = np.sqrt(variance[:, None] * np.diag(np.linalg.inv(camera.T @ camera)))

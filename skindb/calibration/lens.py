@@ -84,7 +84,7 @@ def _robust_fit(design: Float64, value: Float64) -> tuple[Float64, Float64, Mask
     """
     inliers = np.ones(len(value), bool)
     for _ in range(ROUNDS):
-        solution = np.linalg.lstsq(design[inliers], value[inliers], rcond=None)[0]
+        solution = np.linalg.lstsq(design[inliers], value[inliers])[0]
         residual = value - design @ solution
         spread = float(robust_deviation(residual[inliers]))
         limit = MAX_DEVIATIONS * max(spread, 1e-12 * abs(solution[0]))

@@ -70,7 +70,7 @@ def write_report(path: Path, results: Results, *, progress: Progress) -> Path:
     portraits = draw_portraits(results.models)
     counts = {
         take: np.bincount(
-            model["fitted"].to_dataset()[variables.FIT_STATUS].values,
+            model["fitted"].dataset[variables.FIT_STATUS].values,
             minlength=len(FitStatus),
         )
         for take, model in results.models.items()

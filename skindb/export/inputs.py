@@ -45,8 +45,8 @@ def texture_size(model: xr.DataTree) -> int:
     """Texels along each side of maps without loss: 1.5 per spacing of the surfels,
     rounded up to a power of two.
     """
-    uv = model["fitted"].to_dataset()[variables.SURFEL_UV].values
-    triangles = model["mesh"].to_dataset()[variables.TRIANGLE].values
+    uv = model["fitted"].dataset[variables.SURFEL_UV].values
+    triangles = model["mesh"].dataset[variables.TRIANGLE].values
     corners = uv.astype(float)[triangles]
     edge = np.median(lengths(corners - np.roll(corners, 1, axis=1)))
     texels = TEXELS_PER_SPACING / max(float(edge), 1e-6)
@@ -99,7 +99,7 @@ def required(model: xr.DataTree) -> xr.Dataset:
     """
     fitted = model["fitted"].to_dataset()
     check(fitted, REQUIRED, where="fitted")
-    triangles = model["mesh"].to_dataset()[variables.TRIANGLE].values
+    triangles = model["mesh"].dataset[variables.TRIANGLE].values
     corner = fitted[variables.SURFEL_UV].values[triangles].astype(float)
     is_finite = np.isfinite(corner).all()
     require(

@@ -66,8 +66,8 @@ class Atlas:
     @classmethod
     def of(cls, model: xr.DataTree, size: int) -> Atlas:
         """The atlas of a model with `size` texels along each side."""
-        uv = model["fitted"].to_dataset()[variables.SURFEL_UV].values
-        triangles = model["mesh"].to_dataset()[variables.TRIANGLE].values
+        uv = model["fitted"].dataset[variables.SURFEL_UV].values
+        triangles = model["mesh"].dataset[variables.TRIANGLE].values
         return cls(triangles, rasterise_atlas(uv, triangles, size))
 
     def confidence(self, trust: Float32) -> Image:

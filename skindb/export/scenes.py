@@ -73,7 +73,7 @@ def _mesh(model: xr.DataTree) -> dict[str, str]:
     """The mesh as texts of a USD stage."""
     fitted = model["fitted"].to_dataset()
     place = fitted[variables.SURFEL_POSITION].values.astype(np.float32)
-    triangles = model["mesh"].to_dataset()[variables.TRIANGLE].values
+    triangles = model["mesh"].dataset[variables.TRIANGLE].values
     # v increases upwards in USD
     uv = fitted[variables.SURFEL_UV].values.astype(float) * [1, -1] + [0, 1]
     return {
@@ -108,7 +108,7 @@ def export_mitsuba(model: xr.DataTree, folder: Path) -> None:
     u, v = fitted[variables.SURFEL_UV].values.astype(np.float32).T
     mesh = trimesh.Trimesh(
         fitted[variables.SURFEL_POSITION].values,
-        model["mesh"].to_dataset()[variables.TRIANGLE].values,
+        model["mesh"].dataset[variables.TRIANGLE].values,
         vertex_normals=unit_normals(fitted, variables.SHADING_NORMAL),
         vertex_attributes={"u": u, "v": v},
         process=False,

@@ -366,7 +366,7 @@ def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
             (ones, reflection * ones),
         )
     ]
-    shape = _shape(fitted, model["mesh"].to_dataset()[variables.TRIANGLE].values)
+    shape = _shape(fitted, model["mesh"].dataset[variables.TRIANGLE].values)
     top = float(max(skin.f0.max(), MIN_F0))
     bent = to_tangent_space(shape.shading, shape.normal, shape.tangent)
     columns = np.zeros((len(trust), 9), np.float32)

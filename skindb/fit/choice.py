@@ -133,7 +133,7 @@ class Trial:
             self.samples,
             diffuse,
             surfels["light_visible_fraction"].values[:, self.lights],
-            self.capture["mesh"].to_dataset()["triangle"].values,
+            self.capture["mesh"].dataset["triangle"].values,
             eta=self.parameters.eta,
             receivers=self.surfels,
         )
@@ -178,7 +178,7 @@ def choose_corrections(
         inter_reflection=parameters.inter_reflection is True,
     )
     training = fitted_part(samples, held_out)
-    count = capture["samples"].to_dataset()["sample_count"].values
+    count = capture["samples"].dataset["sample_count"].values
     patches = _patches(len(count))
     near = np.concatenate([np.arange(p.start, p.stop) for p in patches])
     usable = near[count[near] >= MIN_SAMPLES]

@@ -222,7 +222,7 @@ def estimate_camera_gains(
         columns = view.shading[0][view.lights]
         if _smooth(columns, seen.mean(axis=1)) is None:
             continue
-        level = np.linalg.lstsq(columns, seen, rcond=None)[0][2]
+        level = np.linalg.lstsq(columns, seen)[0][2]
         leaves = fresnel_transmittance(view.cosine, eta)
         if (level > 0).all():
             logs[view.surfel, view.camera] = np.log(level / leaves)
@@ -266,7 +266,7 @@ def gain_spread(logs: Array, towards: Array) -> float:
     linear = np.column_stack([np.ones(known.sum()), towards[known]])
     if len(linear) < 2 * linear.shape[1]:
         linear = linear[:, :1]
-    rest = logs[known] - linear @ np.linalg.lstsq(linear, logs[known], rcond=None)[0]
+    rest = logs[known] - linear @ np.linalg.lstsq(linear, logs[known])[0]
     spare = len(linear) - linear.shape[1]
     return float(np.sqrt(np.square(rest).sum() / spare)) if spare > 0 else np.nan
 
@@ -389,7 +389,7 @@ def _smooth(columns: Array, seen: Array) -> Array | None:
     """Coefficients (SMOOTH,) of the smooth function that is nearest to samples (light,);
     None if a sample is far from it, or the function near 0.
     """
-    smooth = np.linalg.lstsq(columns, seen, rcond=None)[0]
+    smooth = np.linalg.lstsq(columns, seen)[0]
     fitted = columns @ smooth
     if fitted.min() <= SMALLEST_SHADING * max(np.median(fitted), 0.0):
         return None

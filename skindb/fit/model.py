@@ -354,7 +354,7 @@ def _direct_light(
     diffuse = fitted["diffuse_reflectance"].values
     surfels = capture["surfels"].to_dataset()
     visible = surfels["light_visible_fraction"].values
-    triangles = capture["mesh"].to_dataset()["triangle"].values
+    triangles = capture["mesh"].dataset["triangle"].values
     return without_bounce(
         samples,
         bounced_light(samples, diffuse, visible, triangles, eta=eta),

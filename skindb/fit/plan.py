@@ -88,10 +88,10 @@ def plan_fit(
         "only the probe was measured" if probe else "neither dome nor probe",
         "photograph the subject in the dome, or exclude this take",
     )
-    surfels = capture["samples"].to_dataset()["sample_count"].values > 0
+    surfels = capture["samples"].dataset["sample_count"].values > 0
     # a light that is hidden from every sampled surfel has no samples; dark lights
     # cannot be ingested
-    fraction = capture["surfels"].to_dataset()["light_visible_fraction"].values
+    fraction = capture["surfels"].dataset["light_visible_fraction"].values
     reached = np.asarray((fraction[surfels] > 0).any(axis=0))
     require(
         surfels.any() and reached.any(),
@@ -168,7 +168,7 @@ def hold_out(
         photographs are chosen first, so that a comparison with such a photograph is a
         prediction.
     """
-    visible = capture["surfels"].to_dataset()["camera_visible_fraction"]
+    visible = capture["surfels"].dataset["camera_visible_fraction"]
     # cameras that see no surfel are useless for a test
     seeing = np.ones(visible.sizes["camera"], np.bool_)
     if parameters.hold_out_cameras:
@@ -217,7 +217,7 @@ def _drawn(
     order = np.random.default_rng(seed).permutation(np.flatnonzero(useful))
     if "photographs" in capture.children:
         photographed = np.isin(
-            order, capture["photographs"].to_dataset()[f"photograph_{dim}"].values
+            order, capture["photographs"].dataset[f"photograph_{dim}"].values
         )
         order = order[np.argsort(~photographed, kind="stable")]
     return np.sort(

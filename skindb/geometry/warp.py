@@ -174,7 +174,7 @@ def fit_warp(
         warp = _without_folds(fallback, centre, goal, is_weak, attempts, min_area)
         if warp is not None:
             return warp
-    affine = np.linalg.lstsq(_linear(a), b, rcond=None)[0]
+    affine = np.linalg.lstsq(_linear(a), b)[0]
     if np.linalg.det(affine[1:]) <= min_area:
         return fallback
     return replace(fallback, kind="affine", affine=affine)

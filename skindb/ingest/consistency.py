@@ -404,7 +404,7 @@ class CalibrationCheck:
         rows = {c: self._pose_rows(c, offset) for c, offset in offsets.items()}
         matrix = np.concatenate([slopes for slopes, _ in rows.values()])
         right = np.concatenate([moves for _, moves in rows.values()])
-        x = np.linalg.lstsq(matrix, right, rcond=None)[0]
+        x = np.linalg.lstsq(matrix, right)[0]
         for c, (slopes, moves) in rows.items():
             residual = (moves - slopes @ x).reshape(-1, 2)
             length = float(np.sqrt((residual**2).sum(axis=1).mean()))

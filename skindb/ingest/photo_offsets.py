@@ -265,7 +265,7 @@ def _gauss_newton(
         scale = ROBUST_SCALE * float(robust_deviation(residual)) + FLOOR
         weight = 1 / (1 + (residual / scale) ** 2)
         weighted = (matrix * weight[:, None]).T
-        step = np.linalg.lstsq(weighted @ matrix, weighted @ residual, rcond=None)[0]
+        step = np.linalg.lstsq(weighted @ matrix, weighted @ residual)[0]
         move += step
         if np.abs(step).max() < SMALL_STEP:
             break

@@ -225,7 +225,7 @@ def _turn(check: CalibrationCheck, c: int, offset: Offset) -> Float64:
         for axis in np.eye(3)
     ]
     matrix = np.stack(slopes, axis=1)
-    return np.asarray(np.linalg.lstsq(matrix, moves.ravel(), rcond=None)[0])
+    return np.asarray(np.linalg.lstsq(matrix, moves.ravel())[0])
 
 
 def _turned(camera: CameraRecord, turn: Float64) -> CameraRecord:

@@ -171,7 +171,7 @@ def _near_polynomial(
     weighted least squares.
     """
     x = np.vander(np.log(ring / SEAM), POWERS + 1, increasing=True)[:, 1:]
-    solution = np.linalg.lstsq(x / error[:, None], (value - level) / error, rcond=None)
+    solution = np.linalg.lstsq(x / error[:, None], (value - level) / error)
     powers = np.vander(np.log(r / SEAM), POWERS + 1, increasing=True)[:, 1:]
     return powers @ solution[0]
 

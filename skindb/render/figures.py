@@ -74,7 +74,7 @@ def field_figure(
     colour = _colour_dim(values, at)
     chosen = _chosen(values, dict(at), keep=colour)
     position = group[variables.SURFEL_POSITION].values
-    triangle = take["mesh"].to_dataset()[variables.TRIANGLE].values
+    triangle = take["mesh"].dataset[variables.TRIANGLE].values
     views = [trace_front(position, triangle, turn) for turn in turns]
     who = f"{take.attrs.get('subject') or ''} {take.attrs.get('condition', '')}".strip()
     title = ", ".join(

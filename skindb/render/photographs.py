@@ -285,7 +285,7 @@ def _held_out(model: xr.DataTree, dim: str) -> set[str]:
     """Names of the lights or cameras that the fit did not see."""
     if "held_out" not in model.children:
         return set()
-    held = model["held_out"].to_dataset()[f"{dim}_held_out"]
+    held = model["held_out"].dataset[f"{dim}_held_out"]
     return set(map(str, held[dim].values[held.values > 0]))
 
 

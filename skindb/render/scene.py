@@ -206,7 +206,7 @@ def from_model(model: xr.DataTree) -> Surface:
     sigma_tr = values.get(variables.SIGMA_TR)
     return Surface(
         vertices=position.astype(np.float64),
-        faces=model["mesh"].to_dataset()[variables.TRIANGLE].values,
+        faces=model["mesh"].dataset[variables.TRIANGLE].values,
         normals=values[variables.SHADING_NORMAL],
         diffuse=values[variables.DIFFUSE_REFLECTANCE],
         parameters=values["parameters"],

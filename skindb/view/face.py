@@ -174,7 +174,7 @@ def face_record(
         f"fit again with --k {MAX_TABLES} or less",
     )
     values = _values(surface, weights)
-    uv = model["fitted"].to_dataset()[variables.SURFEL_UV].values.astype(np.float32)
+    uv = model["fitted"].dataset[variables.SURFEL_UV].values.astype(np.float32)
     tables = _tables(resampled)
     arrays: dict[str, AnyArray] = {
         "position": surface.vertices.astype(np.float32),

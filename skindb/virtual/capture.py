@@ -546,7 +546,7 @@ def at_foot_points(values: Array, corner: Array) -> Array:
 def _sites(model: xr.DataTree, truth: Mapping[str, Array]) -> dict[str, Array]:
     if "translucency" not in model.children or "site_names" not in truth:
         return {}
-    fitted = model["translucency"].to_dataset()[variables.SITE_SIGMA_TR]
+    fitted = model["translucency"].dataset[variables.SITE_SIGMA_TR]
     true = dict(zip(map(str, truth["site_names"]), truth["site_sigma_tr"], strict=True))
     return {
         str(s): fitted.sel(site=s).values / true[str(s)] - 1

@@ -151,7 +151,7 @@ def tables_of(model: DataTree) -> Dataset:
 def sample_groups(model: DataTree) -> dict[str, Dataset]:
     """The group "sample" of a model; none if no surfel was fitted."""
     if not bool(
-        (model["fitted"].to_dataset()[variables.FIT_STATUS] == FitStatus.FITTED).any()
+        (model["fitted"].dataset[variables.FIT_STATUS] == FitStatus.FITTED).any()
     ):
         return {}
     return {"sample": sample_surfels(model)}

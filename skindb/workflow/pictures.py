@@ -304,7 +304,7 @@ def _nose(model: DataTree) -> np.ndarray[Any, np.dtype[np.float64]]:
     if variables.LANDMARK_POSITION in mesh and LANDMARK in landmarks:
         return float64(mesh[variables.LANDMARK_POSITION].sel(landmark=LANDMARK).values)
     return float64(
-        model["fitted"].to_dataset()[variables.SURFEL_POSITION].values.mean(axis=0)
+        model["fitted"].dataset[variables.SURFEL_POSITION].values.mean(axis=0)
     )
 
 
@@ -313,9 +313,9 @@ def _light(model: DataTree) -> Lights:
     turn = np.radians(LIGHT_DEGREES)
     towards = np.array([np.sin(turn), LIGHT_RISE, np.cos(turn)])
     towards /= np.linalg.norm(towards)
-    power = np.median(
-        model["dome"].to_dataset()[variables.LIGHT_INTENSITY].values, axis=0
-    )[None]
+    power = np.median(model["dome"].dataset[variables.LIGHT_INTENSITY].values, axis=0)[
+        None
+    ]
     return Lights(
         _nose(model)[None] + LIGHT_MM * towards,
         power,
