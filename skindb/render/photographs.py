@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import binary_erosion
 from skimage.metrics import structural_similarity
 
-from skindb.errors import input_error
+from skindb.errors import input_error, require
 from skindb.files import make_private
 from skindb.geometry.rays import RayScene
 from skindb.render.image import auto_exposure, encode_srgb, tone_map, write_png
@@ -262,13 +262,13 @@ def _kept_photographs(capture: xr.DataTree) -> list[xr.Dataset]:
     InputError
         If ingest kept none.
     """
-    if "photographs" not in capture.children:
-        raise input_error(
-            "capture",
-            "must contain kept photographs",
-            "none",
-            "ingest the capture again with --photographs 4",
-        )
+    require(
+        "photographs" in capture.children,
+        "capture",
+        "must contain kept photographs",
+        "none",
+        "ingest the capture again with --photographs 4",
+    )
     photographs = capture["photographs"].to_dataset()
     needed = (
         variables.PHOTOGRAPH_RADIANCE,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb.errors import input_error
+from skindb.errors import require
 from skindb.geometry.rays import RayScene
 from skindb.parameters import RenderParameters
 from skindb.render.image import auto_exposure, tone_map, write_exr, write_png
@@ -144,13 +144,13 @@ def frontal_camera(dome: xr.Dataset) -> int:
 
 
 def _index(names: list[str], name: str, device: str) -> int:
-    if name not in names:
-        raise input_error(
-            f"{device} {name}",
-            f"must be a {device} of the dome",
-            "no such name",
-            f"choose {', '.join(names)}",
-        )
+    require(
+        name in names,
+        f"{device} {name}",
+        f"must be a {device} of the dome",
+        "no such name",
+        f"choose {', '.join(names)}",
+    )
     return names.index(name)
 
 
@@ -374,13 +374,13 @@ def render_picture(
     InputError
         If an option is out of its limits, and as `render`.
     """
-    if out.suffix not in (".exr", ".png"):
-        raise input_error(
-            str(out),
-            "the name of a picture must end in .exr or .png",
-            out.suffix or "no suffix",
-            "change the name",
-        )
+    require(
+        out.suffix in (".exr", ".png"),
+        str(out),
+        "the name of a picture must end in .exr or .png",
+        out.suffix or "no suffix",
+        "change the name",
+    )
     settings = dict(vars(RenderParameters(**options)))
     exposure = settings.pop("exposure")
     view = {key: settings[key] for key in ("lights", "environment", "camera", "scale")}

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from skindb.errors import input_error
+from skindb.errors import input_error, require
 from skindb.geometry.camera import Pinhole
 from skindb.geometry.interreflection import bounce_transfer
 from skindb.geometry.mesh import vertex_normals
@@ -97,13 +97,13 @@ class Camera(Pinhole):
         """
         width = round(self.width * factor)
         height = round(self.height * factor)
-        if not 1 <= width * height <= MAX_PICTURE_PIXELS:
-            raise input_error(
-                "scale",
-                f"a picture must have 1 to {MAX_PICTURE_PIXELS:,} pixels",
-                f"{width} x {height}",
-                "choose a smaller scale",
-            )
+        require(
+            1 <= width * height <= MAX_PICTURE_PIXELS,
+            "scale",
+            f"a picture must have 1 to {MAX_PICTURE_PIXELS:,} pixels",
+            f"{width} x {height}",
+            "choose a smaller scale",
+        )
         K = np.diag([factor, factor, 1.0]) @ self.K
         return replace(self, K=K, width=width, height=height)
 
@@ -192,13 +192,13 @@ def from_model(model: xr.DataTree) -> Surface:
         values[variables.SIGMA_TR] = np.asarray(fitted[variables.SIGMA_TR].values)
     position = values.pop(variables.SURFEL_POSITION)
     usable = usable_surfels(values)
-    if not usable.any():
-        raise input_error(
-            "fitted[fit_status]",
-            "at least one surfel must be fitted for a picture",
-            "none",
-            "see the report of the fit",
-        )
+    require(
+        usable.any(),
+        "fitted[fit_status]",
+        "at least one surfel must be fitted for a picture",
+        "none",
+        "see the report of the fit",
+    )
     del values[variables.FIT_STATUS]
     _, near = cKDTree(position[usable]).query(position)
     nearest = np.flatnonzero(usable)[near]
@@ -279,15 +279,15 @@ def subdivide_surface(surface: Surface, spacing: float, visible: Mask) -> Surfac
         )
         if not len(chosen):
             break
-        if len(vertices) + 3 * len(chosen) > MAX_VERTICES:
-            raise input_error(
-                "spacing",
-                "the part of the face in the picture must have at most "
-                f"{MAX_VERTICES:,} vertices",
-                f"{len(vertices):,} and {len(chosen):,} triangles that are still "
-                f"coarser than {spacing:g} mm",
-                "choose a larger spacing, or a closer picture",
-            )
+        require(
+            len(vertices) + 3 * len(chosen) <= MAX_VERTICES,
+            "spacing",
+            "the part of the face in the picture must have at most "
+            f"{MAX_VERTICES:,} vertices",
+            f"{len(vertices):,} and {len(chosen):,} triangles that are still "
+            f"coarser than {spacing:g} mm",
+            "choose a larger spacing, or a closer picture",
+        )
         vertices, faces, values = trimesh.remesh.subdivide(
             vertices, faces, chosen, vertex_attributes=values
         )

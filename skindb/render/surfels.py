@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from skindb.errors import input_error
+from skindb.errors import input_error, require
 from skindb.geometry.interreflection import tangent_frames
 from skindb.reflectance.kinds import even_diffuse, surface_model
 from skindb.reflectance.model import Lamp, Points, ReflectanceModel
@@ -89,13 +89,13 @@ def surfel_texels(fitted: xr.Dataset) -> Codes:
 def surfel_confidence(fitted: xr.Dataset) -> Float32:
     """(n,) 1 for fitted surfels, 0.5 for doubtful fits, 0 for all others."""
     trust = TRUST[surfel_texels(fitted)]
-    if not trust.any():
-        raise input_error(
-            "fitted[fit_status]",
-            "at least one surfel must be fitted for an export",
-            "none",
-            "see the report of the fit",
-        )
+    require(
+        trust.any(),
+        "fitted[fit_status]",
+        "at least one surfel must be fitted for an export",
+        "none",
+        "see the report of the fit",
+    )
     return trust
 
 
@@ -298,13 +298,13 @@ def _rows_of(
     names = (*NEEDED, *surface.parameter_variables, variables.REFRACTIVE_INDEX)
     check(fitted, names, where="fitted")
     count = fitted.sizes["surfel"]
-    if not 0 <= surfel < count:
-        raise input_error(
-            "surfel",
-            f"surfel must be an index from 0 to {count - 1}",
-            str(surfel),
-            "choose a surfel of this model",
-        )
+    require(
+        0 <= surfel < count,
+        "surfel",
+        f"surfel must be an index from 0 to {count - 1}",
+        str(surfel),
+        "choose a surfel of this model",
+    )
     to_light, to_camera = np.broadcast_arrays(_unit("wi", wi), _unit("wo", wo))
     shape = to_light.shape
     row = fitted.isel(surfel=[surfel]).compute()
@@ -326,13 +326,13 @@ def _rows_of(
 def _unit(name: str, direction: ArrayLike) -> Array:
     """Directions (..., 3) in double precision, checked to be unit vectors and then normalised."""
     vectors = float64(direction)
-    if vectors.ndim == 0 or vectors.shape[-1] != 3:
-        raise input_error(
-            name,
-            "directions must have the shape (..., 3)",
-            f"the shape {vectors.shape}",
-            "put x, y, z last",
-        )
+    require(
+        vectors.ndim and vectors.shape[-1] == 3,
+        name,
+        "directions must have the shape (..., 3)",
+        f"the shape {vectors.shape}",
+        "put x, y, z last",
+    )
     length = lengths(vectors)[..., None]
     if not (np.abs(length - 1) < MAX_LENGTH_ERROR).all():
         worst = length.flat[

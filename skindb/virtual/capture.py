@@ -16,7 +16,7 @@ import trimesh
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.errors import input_error
+from skindb.errors import require
 from skindb.files import make_private, private_file
 from skindb.geometry.rays import RayScene
 from skindb.optics.diffusion import dipole_s
@@ -284,13 +284,13 @@ def simulate_take(
 
 
 def _require_empty(out: Path) -> None:
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise input_error(
-            str(out),
-            "a new capture needs an absent or empty folder",
-            "existing files",
-            "choose another folder",
-        )
+    require(
+        not out.exists() or (out.is_dir() and not any(out.iterdir())),
+        str(out),
+        "a new capture needs an absent or empty folder",
+        "existing files",
+        "choose another folder",
+    )
 
 
 @cache

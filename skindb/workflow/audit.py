@@ -18,7 +18,7 @@ from functools import partial, wraps
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
-from skindb.errors import InputError, SkindbWarning, input_error
+from skindb.errors import InputError, SkindbWarning, require
 from skindb.files import Attributes
 
 if TYPE_CHECKING:
@@ -241,12 +241,12 @@ def _checked_actor(source: str, actor: str) -> str:
         and actor == actor.strip()
         and 0 < len(actor) <= MAX_ACTOR_CHARACTERS
     )
-    if not is_valid:
-        raise input_error(
-            source,
-            f"must be 1 to {MAX_ACTOR_CHARACTERS} characters that can be printed, "
-            "without spaces around them",
-            repr(actor)[:200],
-            "choose another name",
-        )
+    require(
+        is_valid,
+        source,
+        f"must be 1 to {MAX_ACTOR_CHARACTERS} characters that can be printed, "
+        "without spaces around them",
+        repr(actor)[:200],
+        "choose another name",
+    )
     return actor

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from xarray import DataTree
 
-from skindb.errors import input_error
+from skindb.errors import input_error, require
 from skindb.export.bundle import export_bundle
 from skindb.export.gltf import export_gltf
 from skindb.files import Json, make_private
@@ -191,16 +191,14 @@ def _model(
 
 
 def _require_outside(db: Database, out: Path) -> None:
-    if db.folder is not None and db.folder.resolve() in (
-        out.resolve(),
-        *out.resolve().parents,
-    ):
-        raise input_error(
-            str(out),
-            "pictures and exports are written outside of the database",
-            f"a place inside {db.url}",
-            "choose another folder",
-        )
+    require(
+        db.folder is None
+        or db.folder.resolve() not in (out.resolve(), *out.resolve().parents),
+        str(out),
+        "pictures and exports are written outside of the database",
+        f"a place inside {db.url}",
+        "choose another folder",
+    )
 
 
 @logged("render")
@@ -242,13 +240,13 @@ def translucency_grid(
         If fewer than two takes have translucency at that site.
     """
     lengths = _diffusion_lengths(db, site)
-    if len(lengths) < 2:
-        raise input_error(
-            db.url,
-            f"two takes must have translucency at {site}",
-            f"{len(lengths)}",
-            "name another site, or fit more takes",
-        )
+    require(
+        len(lengths) >= 2,
+        db.url,
+        f"two takes must have translucency at {site}",
+        f"{len(lengths)}",
+        "name another site, or fit more takes",
+    )
     rows = {}
     chosen = dict[str, float]()
     for i, extreme in enumerate((min, max)):

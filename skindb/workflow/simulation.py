@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from skindb.errors import input_error
+from skindb.errors import input_error, require
 from skindb.files import make_private, private_file
 from skindb.format.fields import read_json
 from skindb.parameters import SimulationParameters
@@ -132,13 +132,13 @@ def _begin_cohort(
             for name in sorted({*stored, *options})
             if stored.get(name) != options.get(name)
         ]
-        if differ:
-            raise input_error(
-                str(note),
-                "a cohort is continued with the same options",
-                ", ".join(differ),
-                "give them, or choose another folder",
-            )
+        require(
+            not differ,
+            str(note),
+            "a cohort is continued with the same options",
+            ", ".join(differ),
+            "give them, or choose another folder",
+        )
     elif out.is_dir() and any(out.iterdir()):
         raise input_error(
             str(out),

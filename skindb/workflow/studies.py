@@ -74,13 +74,13 @@ def dictionary_tables(
     stored = (
         embedded_dictionary() if dictionary is None else read_dictionary(dictionary)
     )
-    if list(stored.names) != list(names):
-        raise input_error(
-            "dictionary",
-            "must be the one the takes were fitted with",
-            f"{len(names)} BRDFs, {names[0]} first",
-            "name its folder with --dictionary",
-        )
+    require(
+        list(stored.names) == list(names),
+        "dictionary",
+        "must be the one the takes were fitted with",
+        f"{len(names)} BRDFs, {names[0]} first",
+        "name its folder with --dictionary",
+    )
     return convolve_disc(stored, disc).table
 
 
@@ -229,13 +229,13 @@ def _open_maps(
     open_maps: Callable[[], Dataset],
 ) -> Dataset:
     """Maps of the registered takes; without a probe there is no map of sigma_tr."""
-    if not registered:
-        raise input_error(
-            db.url,
-            "maps need registered takes",
-            f"none of {models.sizes['take']} takes has landmarks",
-            "add landmarks to the captures, then ingest and fit them",
-        )
+    require(
+        registered,
+        db.url,
+        "maps need registered takes",
+        f"none of {models.sizes['take']} takes has landmarks",
+        "add landmarks to the captures, then ingest and fit them",
+    )
     maps = open_maps()
     skipped = [*models.attrs["skipped"], *maps.attrs["skipped"]]
     return maps.assign_attrs(skipped=unique_notes(skipped))
