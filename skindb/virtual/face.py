@@ -87,12 +87,10 @@ def normals(points: Float64, shape: FaceShape) -> Float64:
 def _ellipsoid(
     p: Float64, centre: tuple[float, ...] | Float64, radii: tuple[float, ...]
 ) -> Float64:
-    x, y, z = ((p[i] - centre[i]) / radii[i] for i in range(3))
-    length = np.sqrt(x * x + y * y + z * z + 1e-9)
-    x = x / radii[0]
-    y = y / radii[1]
-    z = z / radii[2]
-    return length * (length - 1) / np.sqrt(x * x + y * y + z * z + 1e-12)
+    scale = float64(radii)[:, None]
+    q = (p - float64(centre)[:, None]) / scale
+    length = np.sqrt((q**2).sum(axis=0) + 1e-9)
+    return length * (length - 1) / np.sqrt(((q / scale) ** 2).sum(axis=0) + 1e-12)
 
 
 def _cone(
@@ -103,14 +101,12 @@ def _cone(
     rb: float,
 ) -> Float64:
     """Round cone: a capsule from `a` to `b` whose radius runs from ra to rb."""
-    axis = float64(b) - float64(a)
-    x, y, z = (p[i] - a[i] for i in range(3))
-    along = np.clip((x * axis[0] + y * axis[1] + z * axis[2]) / (axis @ axis), 0, 1)
+    start = float64(a)[:, None]
+    axis = float64(b)[:, None] - start
+    q = p - start
+    along = np.clip((q * axis).sum(axis=0) / (axis**2).sum(), 0, 1)
     along = along * along * (3 - 2 * along)  # soft at both ends
-    x = x - along * axis[0]
-    y = y - along * axis[1]
-    z = z - along * axis[2]
-    return np.sqrt(x * x + y * y + z * z) - ra - along * (rb - ra)
+    return np.sqrt(((q - along * axis) ** 2).sum(axis=0)) - ra - along * (rb - ra)
 
 
 def _join(a: Float64, b: Float64, blend: float) -> Float64:
@@ -124,6 +120,11 @@ def _carve(a: Float64, b: Float64, blend: float) -> Float64:
     return -_join(-a, b, blend)
 
 
+def _bell(*distances: Float64) -> Float64:
+    """Gaussian of the distance whose components are given."""
+    return np.exp(-0.5 * sum(distance**2 for distance in distances))
+
+
 def _press(
     p: Float64,
     distance: Float64,
@@ -132,8 +133,8 @@ def _press(
     depth: float,
 ) -> Float64:
     """Push the skin in by `depth` under a Gaussian (a negative depth lifts it)."""
-    x, y, z = ((p[i] - centre[i]) / width[i] for i in range(3))
-    return distance + depth * np.exp(-0.5 * (x * x + y * y + z * z))
+    q = (p - float64(centre)[:, None]) / float64(width)[:, None]
+    return distance + depth * _bell(*q)
 
 
 def _skull(p: Float64, s: FaceShape) -> Float64:
@@ -187,11 +188,9 @@ def _eyes(p: Float64, d: Float64, s: FaceShape) -> Float64:
         np.hypot((p[1] - arc) / 1.0, (p[2] - 91) / 12)
         + np.maximum(np.abs(p[0] - x) - 13, 0) ** 2 / 12
     )
-    d = d + 0.9 * np.exp(-0.5 * crease**2)
+    d = d + 0.9 * _bell(crease)
     slit = np.hypot((p[1] - lid_height(p[0], s)) / 0.9, (p[2] - 90) / 12)
-    d = d + 0.7 * np.exp(
-        -0.5 * (slit**2 + (np.maximum(np.abs(p[0] - x) - 13, 0) / 2) ** 2)
-    )
+    d = d + 0.7 * _bell(slit, np.maximum(np.abs(p[0] - x) - 13, 0) / 2)
     # below the eye
     return _press(p, d, (x - 3, 18, 92), (11, 3.5, 14), 1.6 * s.sagging)
 
@@ -218,18 +217,16 @@ def _nose(p: Float64, d: Float64, s: FaceShape) -> Float64:
     )
     groove = np.hypot((p[0] - w + 4.5) / 2.6, (p[1] - tip[1] + 16) / 3.5)
     nostril = np.hypot(groove, (p[2] - tip[2] + 6) / 6)
-    d = d + 2.4 * np.exp(-0.5 * nostril**2)
+    d = d + 2.4 * _bell(nostril)
     alar = np.hypot(p[0] - w, (p[1] - tip[1] + 9) * 0.9) - 10.5
-    return d + 0.9 * np.exp(
-        -0.5 * (alar / 2.0) ** 2 - 0.5 * ((p[2] - tip[2] + 14) / 7) ** 2
-    )
+    return d + 0.9 * _bell(alar / 2.0, (p[2] - tip[2] + 14) / 7)
 
 
 def _mouth(p: Float64, d: Float64, s: FaceShape) -> Float64:
     y = s.mouth_height
     w = s.mouth_width
     full = s.lip_fullness
-    bow = -0.0045 * p[0] ** 2 + 1.2 * np.exp(-0.5 * ((p[0] - 6) / 4) ** 2)
+    bow = -0.0045 * p[0] ** 2 + 1.2 * _bell((p[0] - 6) / 4)
     q = np.stack([p[0], p[1] - bow, p[2] + 0.014 * p[0] ** 2])
     upper = _ellipsoid(q, (0, y + 3.2, 102.0), (w, 5.6 + 3.4 * full, 9.2 + 3.4 * full))
     d = _join(d, upper, 8)
@@ -239,9 +236,7 @@ def _mouth(p: Float64, d: Float64, s: FaceShape) -> Float64:
     d = _join(d, lower, 9)
     line = y + mouth_line(p[0])
     inside = np.maximum(np.abs(p[0]) - w + 1, 0) / 2.0
-    d = d + 2.6 * np.exp(
-        -0.5 * (((p[1] - line) / 1.5) ** 2 + inside**2 + ((p[2] - 108) / 16) ** 2)
-    )
+    d = d + 2.6 * _bell((p[1] - line) / 1.5, inside, (p[2] - 108) / 16)
     # corners
     d = _press(p, d, (w + 2.0, y - 1.5, 96), (4.5, 5, 12), 1.0 + 0.5 * s.sagging)
     return _press(p, d, (0, y + 14, 110), (3.0, 6, 10), 1.3)  # philtrum
@@ -249,11 +244,7 @@ def _mouth(p: Float64, d: Float64, s: FaceShape) -> Float64:
 
 def mouth_line(x: Float64) -> Float64:
     """Height of the line between the lips at |x|, above `mouth_height`."""
-    return (
-        -0.6 * np.exp(-0.5 * (x / 4) ** 2)
-        + 0.8 * np.exp(-0.5 * ((np.abs(x) - 8) / 5) ** 2)
-        - 0.003 * x**2
-    )
+    return -0.6 * _bell(x / 4) + 0.8 * _bell((np.abs(x) - 8) / 5) - 0.003 * x**2
 
 
 def landmark_directions(shape: FaceShape, centre: Float64) -> dict[str, Float64]:
@@ -375,11 +366,7 @@ def _lips(x: Float64, y: Float64, z: Float64, s: FaceShape) -> Float64:
     """The red of the lips: between two arcs that meet in the corners."""
     line = s.mouth_height + mouth_line(x)
     taper = np.sqrt(np.clip(1 - (x / (s.mouth_width - 0.5)) ** 2, 0, 1))
-    bow = (
-        1.0
-        + 0.22 * np.exp(-0.5 * ((x - 6) / 4) ** 2)
-        - 0.1 * np.exp(-0.5 * (x / 3) ** 2)
-    )
+    bow = 1.0 + 0.22 * _bell((x - 6) / 4) - 0.1 * _bell(x / 3)
     upper = (5.2 + 3.2 * s.lip_fullness) * taper * bow
     lower = (6.6 + 3.6 * s.lip_fullness) * taper
     return (
@@ -394,7 +381,7 @@ def _lashes(points: Float64, shape: FaceShape) -> Float64:
     """How dark the closed lids' lashes make each point, 0 to 1."""
     x = np.abs(points[:, 0]) / shape.width
     y = points[:, 1] / shape.height
-    across = np.exp(-0.5 * ((y - lid_height(x, shape) + 0.6) / 1.3) ** 2)
+    across = _bell((y - lid_height(x, shape) + 0.6) / 1.3)
     return (
         across
         * _soft(14.5 - np.abs(x - shape.eye_distance), 2)

@@ -149,15 +149,18 @@ def _project(points: Float64, shape: FaceShape, *, rounds: int = 1) -> Float64:
     with a constant slope).
     """
     value = field(points, shape)
-    slope = (
-        np.stack([field(points + d, shape) - value for d in STEP * np.eye(3)], axis=1)
-        / STEP
-    )
+    slope = _slope(points, value, shape)
     slope /= np.maximum((slope**2).sum(axis=1, keepdims=True), LEAST_SLOPE**2)
     points = points - value[:, None] * slope
     for _ in range(rounds - 1):
         points = points - field(points, shape)[:, None] * slope
     return points if rounds == 1 else _settle(points, shape)
+
+
+def _slope(points: Float64, value: Float64, shape: FaceShape) -> Float64:
+    """Gradient (n, 3) of the field at points where its value is known."""
+    moved = [field(points + step, shape) for step in STEP * np.eye(3)]
+    return (np.stack(moved, axis=1) - value[:, None]) / STEP
 
 
 def _settle(points: Float64, shape: FaceShape) -> Float64:
@@ -170,12 +173,7 @@ def _settle(points: Float64, shape: FaceShape) -> Float64:
         if not len(far):
             break
         near = points[far]
-        slope = (
-            np.stack(
-                [field(near + d, shape) - value[far] for d in STEP * np.eye(3)], axis=1
-            )
-            / STEP
-        )
+        slope = _slope(near, value[far], shape)
         steepness = np.maximum(lengths(slope)[..., None], LEAST_SLOPE)
         # mm: the range in which the slope is valid
         step = np.clip(value[far, None] / steepness, -0.5, 0.5)
