@@ -25,7 +25,7 @@ from skindb.analysis.study import (
     shared_once,
     skipped_takes,
 )
-from skindb.errors import Fault, InputError, require
+from skindb.errors import Fault, require, require_none
 from skindb.numerics.factorise import Sums, nmf, refine
 from skindb.numerics.nnls import solve_nnls
 from skindb.numerics.statistics import bootstrap_interval
@@ -176,8 +176,7 @@ def _start_weights(cohort: Dataset, takes: Sequence[str], rng: Generator) -> Arr
         for take, weights in zip(takes, starts, strict=True)
         if not len(weights)
     ]
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
     return np.concatenate([rng.permutation(weights)[:part] for weights in starts])
 
 

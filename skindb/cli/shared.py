@@ -22,7 +22,14 @@ import skindb
 from skindb import workflow
 from skindb.cli.options import asked
 from skindb.cli.terminal import Progress, echo
-from skindb.errors import Fault, InputError, few_names, input_error, require
+from skindb.errors import (
+    Fault,
+    InputError,
+    few_names,
+    input_error,
+    require,
+    require_none,
+)
 from skindb.files import Json, plain
 
 if TYPE_CHECKING:
@@ -83,8 +90,7 @@ def emit(result: Any, lines: list[str], faults: Sequence[Fault] = ()) -> None:
         echo(*lines)
     if asked("verbose"):
         echo(f"{time.monotonic() - asked('since'):.1f} s", err=True)
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
 
 
 def serve(server: PageServer, **values: Any) -> None:

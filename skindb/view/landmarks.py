@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from skindb.errors import Fault, InputError, require
+from skindb.errors import Fault, require, require_none
 from skindb.format.fields import read_json
 from skindb.format.scan_checks import (
     coincidence_faults,
@@ -120,8 +120,7 @@ def _existing(path: Path) -> Any:
         return {}
     faults = list[Fault]()
     stored = read_json(path, faults)
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
     return stored
 
 
@@ -147,8 +146,7 @@ def parsed_points(value: Any, file: str) -> dict[str, Float64]:
         for name, p in value.items()
         if not is_point(p)
     ]
-    if wrong:
-        raise InputError(wrong)
+    require_none(wrong)
     return {name: np.array(p, float) for name, p in value.items()}
 
 
@@ -320,8 +318,7 @@ def _save(task: LandmarkTask, request: dict[str, Any]) -> dict[str, Any]:
         if request.get("crop") is None
         else parsed_crop(request["crop"], "crop box")
     )
-    if faults := landmark_mistakes(task, points, crop):
-        raise InputError(faults)
+    require_none(landmark_mistakes(task, points, crop))
     confirmed = request.get("confirmed")
     questions = open_questions(task, points, seen=str(request.get("seen", "")))
     if any(

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import imagecodecs
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from skindb.files import make_private, private_file
 from skindb.geometry.rays import RayScene
@@ -147,12 +148,8 @@ def _apart(eyes: Float64, lamps: Float64) -> Float64:
     """Rotate cameras about +z if a light obstructs their view (a light's disc is 1.6
     degrees wide).
     """
-    turn = np.radians(1.5)
-    spin = np.array(
-        [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]
-    )
-    lift = np.array(
-        [[1, 0, 0], [0, np.cos(turn), -np.sin(turn)], [0, np.sin(turn), np.cos(turn)]]
+    spin, lift = (
+        Rotation.from_euler(axis, 1.5, degrees=True).as_matrix() for axis in "zx"
     )
     out = eyes.copy()
     for i in range(len(out)):

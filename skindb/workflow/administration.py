@@ -16,7 +16,7 @@ from typing import Any
 import skindb
 from skindb import __version__, store
 from skindb.clock import utc_time
-from skindb.errors import Fault, InputError, few_names
+from skindb.errors import Fault, InputError, few_names, require_none
 from skindb.files import private_file
 from skindb.store import (
     CALIBRATION,
@@ -305,8 +305,7 @@ def withdraw(
         )
         erased, faults = _erase_from_backups(db, backups, wait)
         repeated = skindb.workflow.repeat_requests(db, dictionary=dictionary)
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
     return replace(
         plan,
         removed=dict(sorted((Counter(plan.removed) | erasure.removed).items())),

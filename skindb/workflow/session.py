@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from skindb.clock import SYSTEM_CLOCK, Clock, SimulatedClock, utc_time
-from skindb.errors import Fault, InputError, input_error
+from skindb.errors import Fault, input_error, require_none
 from skindb.files import Json, make_private, private_umask
 from skindb.format.fields import IDENTIFIER, read_json
 from skindb.format.folder import read_capture, record_faults
@@ -186,8 +186,7 @@ def _require_parameters(parameters: SessionParameters, needed: Iterable[str]) ->
                 )
             )
     faults += _subject_faults(parameters) + _operator_faults(parameters)
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
 
 
 def _rehearsal_faults(parameters: SessionParameters) -> list[Fault]:

@@ -38,7 +38,14 @@ from loky.process_executor import BrokenProcessPool
 
 from skindb import __version__
 from skindb.elementwise import thread_count
-from skindb.errors import Fault, InputError, input_error, require, system_fault
+from skindb.errors import (
+    Fault,
+    InputError,
+    input_error,
+    require,
+    require_none,
+    system_fault,
+)
 from skindb.files import make_private, package_digest, private_file
 from skindb.threads import one_blas_thread
 from skindb.workflow.audit import as_part
@@ -607,8 +614,7 @@ def results_of(outcomes: Iterable[Outcome[Take, Result]]) -> Iterator[Result]:
             yield outcome.result()
         else:
             faults += faults_of(outcome)
-    if faults:
-        raise InputError(faults)
+    require_none(faults)
 
 
 def faults_of(outcome: Outcome[Take, Result]) -> list[Fault]:
