@@ -477,8 +477,8 @@ def _surface_rows(
 
 
 def plot_basis_size(curves: Mapping[str, Dataset], *, ax: Axes | None = None) -> Axes:
-    """Plot errors against k with 95 % intervals, and mark the sizes that may suffice
-    (Weyrich et al. 2005, figure 15).
+    """Plot by how much errors exceed that of the dictionary against k, with 95 % intervals,
+    and mark the sizes that may suffice (Weyrich et al. 2005, figure 15).
 
     Parameters
     ----------
@@ -493,7 +493,8 @@ def plot_basis_size(curves: Mapping[str, Dataset], *, ax: Axes | None = None) ->
     ):
         k = curve["k"].values
         error, low, high = (
-            curve[f"{variables.RELATIVE_ERROR}{end}"] for end in ("", "_low", "_high")
+            100 * (curve[f"{variables.RELATIVE_ERROR}{end}"] - 1)
+            for end in ("", "_low", "_high")
         )
         ax.fill_between(k, low, high, color=colour, alpha=0.25, linewidth=0)
         label = f"{name} (n = {curve.attrs['surfels']:,} surfels): {size_range(curve)}"
@@ -503,7 +504,8 @@ def plot_basis_size(curves: Mapping[str, Dataset], *, ax: Axes | None = None) ->
         chosen = (k >= int(curve[variables.SMALLEST_SIZE])) & (k <= last)
         ax.plot(k[chosen], error[chosen], linestyle="none", **style)
     ax.set_xlabel("number of basis BRDFs k (filled: sizes that may suffice)")
-    ax.set_ylabel("error of reflectance / error with whole dictionary")
+    ax.set_yscale("log", nonpositive="clip")
+    ax.set_ylabel("error above that of the dictionary [%]")
     ax.legend(fontsize=8)
     return ax
 
