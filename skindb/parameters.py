@@ -713,6 +713,13 @@ class ViewParameters(Limited):
     study: str | None = option(
         None, "Study of traits.  [default: traits, or the only one there is]"
     )
+    modes: int = option(
+        0,
+        "Number of modes of the study of components that get a slider, which moves "
+        "shape, albedo, gloss and translucency.",
+        minimum=0,
+        maximum=20,
+    )
     environment: Path | None = option(
         None,
         "Latitude-longitude image of light from all directions (.exr).  [default: "

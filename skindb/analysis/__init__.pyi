@@ -27,7 +27,7 @@ from .correlations import (
     plot_correlations,
 )
 from .coverage import coverage_report, describe_coverage, plot_coverage
-from .edit import apply_traits, describe_edit
+from .edit import apply_traits, describe_edit, move_along_modes
 from .face_files import write_face_model
 from .face_models import condition_face_model, face_at, face_model, sample_faces
 from .formula_models import describe_model, linear_model, plot_model
@@ -108,6 +108,7 @@ __all__ = [
     "group_effects",
     "groups_by",
     "linear_model",
+    "move_along_modes",
     "plot_albedo",
     "plot_basis_size",
     "plot_brdf_space",

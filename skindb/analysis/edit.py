@@ -4,20 +4,25 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 from xarray import Dataset, DataTree
 
 from skindb.analysis.albedo import cumulative, decorrelate, histogram, quantiles
 from skindb.analysis.brdf import project
+from skindb.analysis.face_models import BLOCKS, block_rows
 from skindb.analysis.subjects import trait_name
 from skindb.analysis.texture import at_surfels, edit_texture
 from skindb.errors import Fault, InputError, require
+from skindb.geometry.atlas import push_pull
+from skindb.geometry.mesh import vertex_normals
 from skindb.numerics.texture import quantile_levels, valid_quantiles
 from skindb.optics.diffusion import dipole_s
 from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, stored_brdf
 from skindb.schema import GROUPS, Use, check, dataset, label, names_of, variables
 from skindb.schema.consent import honour_consent
 from skindb.schema.label import FACE, take_attrs
-from skindb.types import Array, Mask, finite_rows, float64
+from skindb.types import Array, Mask, finite_rows, float64, unit
 
 Report = dict[str, Any]
 # limits of an edited albedo
@@ -212,6 +217,60 @@ def _mean(fitted: Dataset, values: Array) -> Array:
     good = finite_rows(values)
     area = fitted[variables.SURFEL_AREA].values[good].astype(float)
     return np.asarray(np.average(values[good], axis=0, weights=area))
+
+
+def move_along_modes(
+    model: DataTree, scores: ArrayLike, *, faces: Dataset, uv: Array
+) -> DataTree:
+    """Copy of a model whose positions, normals, R_d, sigma_tr and weights of the surface
+    are moved along modes of a population.
+
+    Parameters
+    ----------
+    model
+        Version of kind "model" or "edit".
+    scores
+        Steps along the first modes, in standard deviations.
+    faces
+        From `face_model`; beyond its texels, steps are extrapolated.
+    uv
+        (surfel, 2) common (u, v) of the surfels, from `register`.
+    """
+    fitted = model["fitted"].to_dataset().load()
+    steps = float64(scores)
+    modes = np.tensordot(steps, faces[variables.FACE_MODE].values[: len(steps)], 1)
+    maps = np.concatenate([faces[variables.FACE_MEAN].values, modes])
+    is_known = np.isfinite(maps).all(axis=0)
+    at = at_surfels(push_pull(np.moveaxis(maps, 0, -1), is_known), uv)
+    mean, step = np.split(at, 2, axis=1)
+    shape, albedo, gloss, translucency = (
+        block_rows(faces["quantity"].values.tolist(), name) for name in BLOCKS
+    )
+    place = float64(fitted[variables.SURFEL_POSITION].values)
+    # the axes of the take are not those of the mean
+    turn, _ = Rotation.align_vectors(
+        place - place.mean(axis=0), mean[:, shape] - mean[:, shape].mean(axis=0)
+    )
+    moved = place + turn.apply(step[:, shape])
+    triangle = model["mesh"].to_dataset()[variables.TRIANGLE].values
+    tilt = vertex_normals(moved, triangle) - vertex_normals(place, triangle)
+    normal = fitted[variables.SHADING_NORMAL].values + np.nan_to_num(tilt)
+    values = {variables.SURFEL_POSITION: moved, variables.SHADING_NORMAL: unit(normal)}
+    factors = {
+        variables.DIFFUSE_REFLECTANCE: np.exp(step[:, albedo]),
+        variables.BASIS_WEIGHT: np.maximum(1 + step[:, gloss] / mean[:, gloss], 0.0),
+        variables.SIGMA_TR: np.exp(step[:, translucency]),
+    }
+    for name, factor in factors.items():
+        if name in fitted and factor.size:
+            values[name] = fitted[name].values * factor
+    colour = np.minimum(values[variables.DIFFUSE_REFLECTANCE], BRIGHTEST)
+    s, _ = dipole_s(colour, eta=float(fitted[variables.REFRACTIVE_INDEX]))
+    values |= {variables.DIFFUSE_REFLECTANCE: colour, variables.DIPOLE_S: s}
+    labelled = {name: label(name, value) for name, value in values.items()}
+    tree = model.copy()
+    tree["fitted"] = DataTree(fitted.assign(labelled))
+    return tree
 
 
 def with_basis(

@@ -127,6 +127,7 @@ class Trait:
     whole: xr.DataTree
     half: xr.DataTree
     amount: float = 1.0
+    symmetric: bool = False  # whether its slider begins at -amount
 
 
 def face_record(
@@ -177,13 +178,12 @@ def face_record(
     uv = model["fitted"].dataset[variables.SURFEL_UV].values.astype(np.float32)
     tables = _tables(resampled)
     arrays: dict[str, AnyArray] = {
+        **{name: value.astype(np.float16) for name, value in values.items()},
         "position": surface.vertices.astype(np.float32),
         "triangles": np.asarray(surface.faces, np.uint32),
-        "normal": surface.normals.astype(np.float16),
         "uv": uv,
         "spacing": uv_spacing(surface.vertices, surface.faces, uv).astype(np.float32),
         "quality": _quality(model, surface).astype(np.float16),
-        **{name: value.astype(np.float16) for name, value in values.items()},
         "tableA": tables[0],
         **({"tableB": tables[1]} if len(tables) > 1 else {}),
     }
@@ -267,8 +267,8 @@ def uv_spacing(vertices: Array, faces: Faces, uv: Array) -> Array:
 
 
 def _values(surface: Surface, mixed: Array) -> dict[str, Array]:
-    """Values that traits change: albedo (n, 3), weights (n, 4) twice, diffusion length
-    (n, 3) [mm].
+    """Values that traits change: positions (n, 3) [mm], normals (n, 3), albedo (n, 3),
+    weights (n, 4) twice, diffusion length (n, 3) [mm].
     """
     weights = np.zeros((len(surface.vertices), MAX_TABLES))
     weights[:, : mixed.shape[1]] = mixed
@@ -276,6 +276,8 @@ def _values(surface: Surface, mixed: Array) -> dict[str, Array]:
     if surface.sigma_tr is not None:
         diffusion = np.nan_to_num(1 / float64(surface.sigma_tr), nan=0.0, posinf=0.0)
     return {
+        "position": surface.vertices,
+        "normal": surface.normals,
         "albedo": np.maximum(surface.diffuse, MIN_ALBEDO),
         "weightA": weights[:, :4],
         "weightB": weights[:, 4:],
@@ -284,8 +286,8 @@ def _values(surface: Surface, mixed: Array) -> dict[str, Array]:
 
 
 def _trait(trait: Trait, plain: Mapping[str, Array]) -> dict[str, Any]:
-    """Change of the arrays by a trait: differences of weights, log ratios of albedo and
-    diffusion length.
+    """Change of the arrays by a trait: log ratios of albedo and diffusion length,
+    differences of the others.
     """
     edited = (from_model(tree) for tree in (trait.whole, trait.half))
     full, half = (
@@ -300,10 +302,11 @@ def _trait(trait: Trait, plain: Mapping[str, Array]) -> dict[str, Any]:
     }
     between = plain["albedo"] * np.exp(0.5 * ratio["albedo"])
     error = float(np.median(np.abs(between / half["albedo"] - 1)))
-    moves = ratio | {name: full[name] - plain[name] for name in ("weightA", "weightB")}
+    moves = {name: value - plain[name] for name, value in full.items()} | ratio
     return {
         "name": trait.name,
         "amount": trait.amount,
+        "least": -trait.amount if trait.symmetric else min(trait.amount, 0.0),
         "error": error,
         "arrays": {
             name: _encode(value.astype(np.float16)) for name, value in moves.items()

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from xarray import DataTree
 
+from skindb.analysis.edit import move_along_modes
 from skindb.errors import input_error, require
 from skindb.export.bundle import export_bundle
 from skindb.export.gltf import export_gltf
@@ -26,7 +27,7 @@ from skindb.render.rendering import (
 )
 from skindb.render.scene import Camera, Environment, Lights
 from skindb.schema import variables
-from skindb.store import Database, intact_or_none, require_fresh
+from skindb.store import STUDY, Database, intact_or_none, require_fresh
 from skindb.types import Progress, float64, silent
 from skindb.view.face import Trait, face_record, page_omissions, still_picture
 from skindb.view.landmarks import landmark_server, landmark_task
@@ -41,6 +42,7 @@ from skindb.view.page import (
     write_page,
 )
 from skindb.workflow.audit import logged
+from skindb.workflow.cohorts import current_registrations, registered_datasets
 from skindb.workflow.edits import editable_model
 
 SIDE_PX = 320  # of a picture
@@ -53,6 +55,8 @@ LIGHT_MM = 800.0  # from the nose
 # of the diffusion length, between the points that receive light in a close-up
 SPACING = 1 / 3
 LANDMARK = "nose_tip"
+COMPONENTS = "components"  # study of modes
+MODE_END = 2.0  # standard deviations at the ends of its slider
 NO_TRAITS: Mapping[str, float] = MappingProxyType({})
 # attributes of a model that a page shows, besides those of the capture
 SHOWN = ("subject", "condition", "session")
@@ -360,7 +364,8 @@ def view_takes(
         Called with the stage, the number of finished takes and the total number of takes.
     **options
         traits, study, dictionary: trait -> amount at the end of its slider (as in
-        `skindb.workflow.edit`), the study of the traits, and the dictionary of the fits.
+        `skindb.workflow.edit`), the study of the traits, and the dictionary of the fits;
+        modes, the number of modes of the study of components that have sliders.
 
     Returns
     -------
@@ -396,7 +401,7 @@ def view_server(
     port
         Port; 0 chooses a free one.
     **options
-        traits, study and dictionary of `view_takes`.
+        traits, study, dictionary and modes of `view_takes`.
 
     Raises
     ------
@@ -451,6 +456,7 @@ def _faces(
     traits: Mapping[str, float] = NO_TRAITS,
     study: str | None = None,
     dictionary: Path | None = None,
+    modes: int = 0,
     environment: Path | None = None,
     progress: Progress = silent,
 ) -> Iterator[tuple[Json, str]]:
@@ -462,6 +468,7 @@ def _faces(
         db.require_consent(take, "export")
         require_fresh(db, "model", take)
         unedited, moved = _moved(db, take, model, traits, study, dictionary)
+        moved += _along_modes(db, take, unedited, modes)
         attributes = {name: model.attrs[name] for name in SHOWN if name in model.attrs}
         if db.has("capture", take):
             attributes |= db.record("capture", take).provenance.get("traits", {})
@@ -520,3 +527,29 @@ def _moved(
         full, half = (source.move({name: part * amount}) for part in (1.0, 0.5))
         moved.append(Trait(name, full, half, amount))
     return plain, tuple(moved)
+
+
+def _along_modes(
+    db: Database, take: str, model: DataTree, count: int
+) -> tuple[Trait, ...]:
+    """A model of a registered take along modes of the population."""
+    if not count:
+        return ()
+    db.require_consent(take, "statistics")
+    faces = db.read(STUDY, COMPONENTS)["face_model"].to_dataset().load()
+    require_fresh(db, STUDY, COMPONENTS)
+    records = current_registrations(db, [take])
+    require(records, take, "must be registered", "none", "run: skindb register DB")
+    registered = registered_datasets(db, records)[take]
+    move = partial(
+        move_along_modes,
+        model,
+        faces=faces,
+        uv=registered[variables.COMMON_UV].values,
+    )
+    moved = []
+    for i in range(min(count, faces.sizes["mode"])):
+        full = np.eye(i + 1)[i] * MODE_END
+        ends = (move(full), move(full / 2))
+        moved.append(Trait(f"mode {i + 1}", *ends, MODE_END, symmetric=True))
+    return tuple(moved)

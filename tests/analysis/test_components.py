@@ -8,11 +8,14 @@ import pytest
 import xarray as xr
 from scipy import stats
 from scipy.linalg import subspace_angles
+from scipy.spatial.transform import Rotation
+from small_face import small_face
 
 from skindb.analysis import (
     condition_face_model,
     face_at,
     face_model,
+    move_along_modes,
     sample_faces,
     write_face_model,
 )
@@ -23,6 +26,7 @@ from skindb.analysis.components import (
 )
 from skindb.analysis.face_models import face_maps, face_vector
 from skindb.errors import InputError
+from skindb.geometry.mesh import vertex_normals
 
 mpl.use("Agg")
 
@@ -135,6 +139,63 @@ def test_face_model__finds_planted_modes_and_slopes(model):
     )
     noise = float(model["noise_variance"])
     assert (ratio.sum("block") - square).values == pytest.approx(noise, rel=0.05)
+
+
+def test_move_along_modes__moves_a_model_by_a_planted_step(model):
+    """At the centres of texels; the take has other axes than the mean."""
+    face = small_face()
+    rng = np.random.default_rng(0)
+    count = face["fitted"].sizes["surfel"]
+    at = rng.integers(SIDE, size=(count, 2))  # u, v
+    turn = Rotation.from_rotvec([0.1, 0.2, -0.3])
+    mean, mode = (
+        model[name].values[..., at[:, 1], at[:, 0]]
+        for name in ("face_mean", "face_mode")
+    )
+    place = turn.apply(mean[:3].T) + np.array([5, 0, 20])
+    fitted = face["fitted"].to_dataset()
+    fitted["surfel_position"] = fitted["surfel_position"].copy(data=place)
+    face["fitted"] = xr.DataTree(fitted)
+    step = 1.5 * mode[1]
+    tree = move_along_modes(face, [0, 1.5], faces=model, uv=(at + 0.5) / SIDE)
+    found = tree["fitted"].to_dataset()
+    # single precision
+    shift = found["surfel_position"] - place
+    np.testing.assert_allclose(shift, turn.apply(step[:3].T), atol=1e-4)
+    for name, factor in (
+        ("diffuse_reflectance", np.exp(step[3:6])),
+        ("basis_weight", 1 + step[6:7] / mean[6:7]),
+        ("sigma_tr", np.exp(step[7:])),
+    ):
+        expected = np.minimum(
+            fitted[name] * factor.T, 0.999 if name == "diffuse_reflectance" else np.inf
+        )
+        np.testing.assert_allclose(found[name], expected, rtol=1e-4)
+    np.testing.assert_allclose((found["shading_normal"] ** 2).sum("xyz"), 1, rtol=1e-4)
+
+
+def test_move_along_modes__normals_are_those_of_the_moved_surface(model):
+    """A mean and a mode of the shape of the face itself: z is stretched."""
+    face = small_face()
+    place = face["fitted/surfel_position"].values.astype(float)
+    stretched = place * [1, 1, 0.3]
+    side = round(np.sqrt(len(place)))
+    maps = np.zeros((2, 10, side, side))
+    maps[0, :3] = place.T.reshape(3, side, side)
+    maps[0, 6] = 1
+    maps[1, :3] = (stretched - place).T.reshape(3, side, side)
+    faces = xr.Dataset(
+        {
+            "face_mean": (("quantity", "v", "u"), maps[0]),
+            "face_mode": (("mode", "quantity", "v", "u"), maps[1:]),
+        },
+        {"quantity": NAMES},
+    )
+    v, u = np.divmod(np.arange(len(place)), side)
+    uv = (np.stack([u, v], axis=1) + 0.5) / side
+    found = move_along_modes(face, [1], faces=faces, uv=uv)["fitted/shading_normal"]
+    expected = vertex_normals(stretched, face["mesh/triangle"].values)
+    np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
 def test_condition__equals_the_conditional_mean_of_the_covariance(model):

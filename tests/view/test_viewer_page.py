@@ -9,6 +9,7 @@ from functools import partial
 import imagecodecs
 import numpy as np
 import pytest
+import xarray as xr
 from browser_page import opened
 from page_session import running
 from scipy.ndimage import binary_erosion
@@ -359,6 +360,45 @@ def test_page__a_slider_ends_at_the_amount_of_its_trait(browser, model, tmp_path
         page.close()
     np.testing.assert_array_equal(pages[20.0], pages[1.0])
     np.testing.assert_array_equal(pages[-0.5], pages[1.0])
+
+
+@pytest.mark.slow
+def test_page__a_mode_moves_the_shape_and_its_shadow(browser, model, tmp_path):
+    """Its picture is that of a page of the moved face."""
+    whole = moved(model, 1.0)
+    mode = Trait("mode 1", whole, moved(model, 0.5), 2.0, symmetric=True)
+    pictures = []
+    for face, modes in ((model, (mode,)), (whole, ())):
+        record = face_record(face, take="S1", attributes={}, traits=modes)
+        write_page(tmp_path / "face.html", [PagedFace.of(record, "")])
+        page = opened(browser, (tmp_path / "face.html").as_uri())
+        view = {"lights": [lamp([300, 0, 200])], "divider": 0, "glow": False}
+        view["exposure"] = exposure(model) / record["about"]["exposure"]
+        pictures.append(square(page, **view))
+        if modes:
+            assert page.get_by_label("mode 1").get_attribute("min") == "-2"
+            page.get_by_label("mode 1").fill("2")
+            pictures.append(square(page, **view))
+        page.close()
+    plain, along, expected = pictures
+    assert np.abs(along - plain).mean() > 0.01
+    # the other pixels are at the edges of shadows
+    assert np.quantile(np.abs(along - expected), 0.99) < 0.01
+
+
+def moved(model, amount):
+    """A face whose nose is longer by a half, or by a fraction of this."""
+    fitted = model["fitted"].to_dataset()
+    stretch = np.array([1, 1, 1 + amount / 2])
+    tilted = fitted["shading_normal"] / stretch
+    tree = model.copy()
+    tree["fitted"] = xr.DataTree(
+        fitted.assign(
+            surfel_position=fitted["surfel_position"] * stretch,
+            shading_normal=tilted / np.sqrt((tilted**2).sum("xyz")),
+        )
+    )
+    return tree
 
 
 @pytest.mark.slow

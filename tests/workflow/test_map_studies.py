@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from planted_sheet import face_take
+from xarray import DataTree
 
 from skindb import workflow
 from skindb.analysis import describe_study, tabulate_study
 from skindb.analysis.studies import STUDIES
 from skindb.cli import cli
 from skindb.store import Database
+from skindb.workflow.pictures import _along_modes
 from skindb.workflow.studies import open_population
 from skindb.workflow.upkeep import repeat_study
 
@@ -85,6 +87,23 @@ def test_components__first_mode_is_the_step(database, tmp_path):
     assert done.exit_code == 0, done.output
     with np.load(out) as file:
         assert file["shape/model/pcaVariance"].shape == (2,)
+
+
+def test_along_modes__are_edits_of_the_take(database):
+    workflow.components(database)
+    model = database.read("model", "S0")
+    fitted = model["fitted"].to_dataset().load().assign(refractive_index=1.3)
+    model["fitted"] = DataTree(fitted)
+    modes = _along_modes(database, "S0", model, 2)
+    assert [mode.name for mode in modes] == ["mode 1", "mode 2"]
+    whole, half = (
+        np.log(tree["fitted/diffuse_reflectance"] / fitted["diffuse_reflectance"])
+        for tree in (modes[0].whole, modes[0].half)
+    )
+    # two standard deviations of two groups of four, with the noise of the takes
+    expected = np.sqrt(8 / 7) * np.log(0.5 / (0.5 - STEP))
+    assert float(np.abs(whole.median())) == pytest.approx(expected, rel=0.05)
+    np.testing.assert_allclose(half, whole / 2, atol=1e-5)
 
 
 def test_correlations__channels_go_together(database):

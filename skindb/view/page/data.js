@@ -1,6 +1,7 @@
 // Decoding of the data of a page into typed arrays.
 "use strict";
 
+const VALUES = ["position", "normal", "albedo", "weightA", "weightB", "diffusion"];  // in the order of the shaders
 const KINDS = { f4: Float32Array, u4: Uint32Array, u2: Uint16Array, u1: Uint8Array, f2: Uint16Array };
 
 async function inflate(text) {
@@ -35,16 +36,13 @@ async function readFace(record) {
   return face;
 }
 
-// values of a face edited along traits: weights change linearly, albedo and diffusion length exponentially
+// values of a face edited along traits: albedo and diffusion length change exponentially, the others linearly
 function editedValues(face, amounts) {
-  const out = {
-    albedo: Float32Array.from(face.albedo), weightA: Float32Array.from(face.weightA),
-    weightB: Float32Array.from(face.weightB), diffusion: Float32Array.from(face.diffusion),
-  };
+  const out = Object.fromEntries(VALUES.map((name) => [name, Float32Array.from(face[name])]));
   face.traits.forEach((trait, at) => {
     const amount = amounts[at];
     if (!amount) return;
-    for (const name of ["weightA", "weightB"])
+    for (const name of ["position", "normal", "weightA", "weightB"])
       for (let i = 0; i < out[name].length; i++) out[name][i] += amount * trait[name][i];
     for (const name of ["albedo", "diffusion"])
       for (let i = 0; i < out[name].length; i++) out[name][i] *= Math.exp(amount * trait[name][i]);

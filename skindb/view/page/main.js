@@ -122,7 +122,7 @@ function showTraits() {
   amounts = face.traits.map(() => 0);
   $("edit").hidden = !face.traits.length;
   face.traits.forEach((trait, i) => {
-    const full = trait.amount, range = { min: Math.min(full, 0), max: Math.max(full, 0), step: Math.abs(full) / 20, value: 0 };
+    const full = trait.amount, range = { min: trait.least, max: Math.max(full, 0), step: Math.abs(full) / 20, value: 0 };
     slider(box, trait.name, range, (x) => { amounts[i] = x / full; applyTraits(); });
     const note = document.createElement("p");
     note.className = "note";

@@ -41,10 +41,9 @@ class Painter {
   }
 
   load(face) {
-    const gl = this.gl, plain = { albedo: face.albedo, weightA: face.weightA, weightB: face.weightB, diffusion: face.diffusion };
-    const sides = face.traits.length ? { plain, edited: plain } : { plain };
-    this.lit = "";
-    this.differ = false;
+    const gl = this.gl, names = face.traits.length ? ["plain", "edited"] : ["plain"];
+    this.lit = this.shadowed = "";
+    this.differ = this.moved = false;
     this.fresh = {};
     this.sum = null;
     for (const side of Object.values(this.sides)) {
@@ -53,19 +52,17 @@ class Painter {
     }
     this.face = face;
     this.visible = new VisibleTriangles(face);
-    this.sides = Object.fromEntries(Object.entries(sides).map(([name, values]) => [name, this.side(face, values)]));
+    this.sides = Object.fromEntries(names.map((name) => [name, this.side(face)]));
     for (const name of ["tableA", "tableB"]) if (this[name]) gl.deleteTexture(this[name]);
     this.tableA = table3d(gl, face.tableShape, face.tableA);
     this.tableB = face.tableB ? table3d(gl, face.tableShape, face.tableB) : this.tableA;
   }
 
-  side(face, values) {
+  side(face) {
     const gl = this.gl, vao = gl.createVertexArray();
     gl.bindVertexArray(vao);
     const buffers = [
-      buffer(gl, 0, 3, gl.FLOAT, face.position), buffer(gl, 1, 3, gl.FLOAT, face.normal),
-      buffer(gl, 2, 3, gl.FLOAT, values.albedo), buffer(gl, 3, 4, gl.FLOAT, values.weightA),
-      buffer(gl, 4, 4, gl.FLOAT, values.weightB), buffer(gl, 5, 3, gl.FLOAT, values.diffusion),
+      ...VALUES.map((name, at) => buffer(gl, at, name.startsWith("weight") ? 4 : 3, gl.FLOAT, face[name])),
       buffer(gl, 6, 2, gl.FLOAT, face.uv), buffer(gl, 7, 1, gl.FLOAT, face.spacing),
       buffer(gl, 8, 2, gl.FLOAT, face.quality),
     ];
@@ -74,7 +71,7 @@ class Painter {
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, face.triangles, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
     const list = gl.createBuffer();  // of the visible triangles, made again for each view
-    return { vao, buffers: [...buffers, index, list], index, list, seen: "", size: 0 };
+    return { vao, buffers: [...buffers, index, list], index, list, visible: this.visible, seen: "", size: 0 };
   }
 
   // `differ` is whether this side differs from the plain one
@@ -84,10 +81,14 @@ class Painter {
     this.fresh[name] = false;
     const gl = this.gl, side = this.sides[name];
     if (!side) return;
-    for (const [at, key] of [[2, "albedo"], [3, "weightA"], [4, "weightB"], [5, "diffusion"]]) {
+    VALUES.forEach((name, at) => {
       gl.bindBuffer(gl.ARRAY_BUFFER, side.buffers[at]);
-      gl.bufferSubData(gl.ARRAY_BUFFER, 0, values[key]);
-    }
+      gl.bufferSubData(gl.ARRAY_BUFFER, 0, values[name]);
+    });
+    const { position, triangles } = this.face;
+    this.moved = values.position.some((x, i) => x !== position[i]);
+    side.visible = this.moved ? new VisibleTriangles({ position: values.position, triangles }) : this.visible;
+    side.seen = this.shadowed = "";
   }
 
   // Draws a picture, or the next part of a picture under many lights; returns the fraction of the picture that is done.
@@ -152,15 +153,15 @@ class Painter {
     const gl = this.gl, { width, height } = this.canvas, { uniforms, matrices } = this.lightUniforms(lights, state);
     // shadows and light under the skin do not change while only the view turns
     const lit = JSON.stringify([lights.map(({ inputs, ...rest }) => rest), state.softness]);
-    if (lit !== this.lit) {
-      this.drawShadows(matrices);
-      this.fresh = {};
-    }
+    if (lit !== this.lit) this.fresh = {};
     this.lit = lit;
     const cut = this.differ ? Math.round(state.divider * width) : width;
     const parts = [["plain", 0, cut], ["edited", cut, width - cut]];
     for (const [name, left, size] of parts) {
       if (size <= 0) continue;
+      const shape = this.moved ? name : "plain";
+      if (this.shadowed !== lit + shape) this.drawShadows(matrices, shape);
+      this.shadowed = lit + shape;
       const glow = state.glow && this.glows && state.withDiffuse;
       if (glow && !this.fresh[name]) this.drawGlow(name, uniforms);
       this.fresh[name] = this.fresh[name] || glow;
@@ -212,8 +213,8 @@ class Painter {
     return { uniforms, matrices };
   }
 
-  drawShadows(matrices) {
-    const gl = this.gl, side = Object.values(this.sides)[0];
+  drawShadows(matrices, name) {
+    const gl = this.gl, side = this.sides[name];
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.shadow.frame);
     gl.viewport(0, 0, SHADOW_SIZE, SHADOW_SIZE);
     gl.enable(gl.DEPTH_TEST);
@@ -292,7 +293,7 @@ class Painter {
     const gl = this.gl, asked = [...matrix, ...span].join();
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, side.list);
     if (side.seen === asked) return;
-    const list = this.visible.select(eye, matrix, ...span);
+    const list = side.visible.select(eye, matrix, ...span);
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, list, gl.DYNAMIC_DRAW);
     Object.assign(side, { seen: asked, size: list.length });
   }
