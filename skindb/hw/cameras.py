@@ -21,6 +21,7 @@ LOOK_SECONDS = 0.05  # interval at which the folders are polled
 QUIET_SECONDS = 15.0
 # fraction of the names with steps of one, of numbers that a camera counts
 MIN_COUNTED = 0.9
+MAX_GAP = 1000  # of such numbers within one run
 # between the arrivals of two files, in which their order is certain
 MIN_ARRIVAL_SECONDS = 0.02
 # fraction of files whose names contradict their arrival, above which names tell nothing
@@ -174,8 +175,14 @@ class FolderCameras:
 def _ordered(arrivals: Mapping[Path, float]) -> list[Shot]:
     """Files of one camera in the order in which they were taken."""
     named = sorted(arrivals, key=lambda path: (_numbers(path), path.name))
-    if len(named) < 2 or _are_counted(named):
+    if len(named) < 2:
         return [Shot(path) for path in named]
+    if _are_counted(named):
+        numbers = np.array([_numbers(path) for path in named]).T
+        gaps = np.diff(numbers).max(axis=0)
+        # a counter that began again at zero
+        begin = int(gaps.argmax()) + 1 if gaps.max() > MAX_GAP else 0
+        return [Shot(path) for path in [*named[begin:], *named[:begin]]]
     place = {path: i for i, path in enumerate(named)}
     paths = sorted(arrivals, key=lambda path: (arrivals[path], place[path]))
     times = np.array([arrivals[path] for path in paths])

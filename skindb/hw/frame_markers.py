@@ -5,11 +5,11 @@ A camera that drops one frame and repeats another delivers as many frames as the
 triggers, and clocks of cameras and files may be set at any time. So a frame is assigned
 to a step only if it lies between two markers in the right place: the frames between them
 must be as many as the steps, no two of them the same picture, and their order certain.
-All others are taken again. After the last marker of a run that was stopped, the frames
-must be as many as the steps that the controller reports.
+All others are taken again, also those after the last marker of a run that was stopped.
 
-The marker light is on, off and on, and then on or off for each bit of the marker's number,
-so that a marker is recognised by its pictures alone.
+The marker light is on, off and on, then on or off for each bit of the marker's number, and
+on: a marker is recognised by its pictures alone, and no dark frame beside it can take the
+place of one of its own. Dark frames have a part of their own.
 """
 
 import math
@@ -39,14 +39,16 @@ from skindb.types import Float64, unit
 
 INTERVAL = 25  # steps between two markers
 BITS = 4  # of the number of a marker
-MARKER = 3 + BITS  # steps of a marker
+MARKER = 4 + BITS  # steps of a marker
 CELLS = 8  # a picture is compared by its means in CELLS x CELLS parts
 # difference between pictures of the marker light in the same state, relative to that
-# between on and off: noise and a subject that breathes stay far below it
-MAX_DIFFERENCE = 0.1
+# between on and off: a subject that moves by 3 mm causes up to 0.15
+MAX_DIFFERENCE = 0.25
 # difference between pictures of two lights, relative to how bright they are, below which
 # they are two pictures of one
 MIN_DIFFERENCE = 0.01
+# of the brightness of the marker light, below which noise hides such a difference
+LIT_FRACTION = 0.03
 
 
 def marker_light(dome: DomeRecord) -> str:
@@ -79,18 +81,28 @@ def with_markers(schedule: Schedule, light: str, *, first: int = 0) -> Schedule:
     length = longest.off_us - longest.on_us
     gap = round(GAP_SECONDS * 1e6)
     # all numbers of one run differ
-    interval = max(INTERVAL, math.ceil(len(schedule.steps) / (2**BITS - 2)))
+    interval = max(INTERVAL, math.ceil(len(schedule.steps) / (2**BITS - 4)))
     steps = list[Step]()
     start = 0
+    number = first
+    begin = 0  # of the part
+    before: Step | None = None
     ends = [step.on_us for step in schedule.steps[1:]] + [schedule.steps[-1].off_us]
     for i, step in enumerate([*schedule.steps, None]):
-        if i % interval == 0 or step is None:
-            number = first + math.ceil(i / interval)
+        if (
+            before is None
+            or step is None
+            or i - begin == interval
+            or (step.light == DARK) != (before.light == DARK)
+        ):
             for is_lit in _code(number % 2**BITS):
                 name = light if is_lit else DARK
                 flash = Step(name, longest.exposure, start, start + length, marker=True)
                 steps.append(flash)
                 start += length + gap
+            number += 1
+            begin = i
+        before = step
         if step is not None:
             duration = step.off_us - step.on_us
             steps.append(replace(step, on_us=start, off_us=start + duration))
@@ -104,7 +116,8 @@ def with_markers(schedule: Schedule, light: str, *, first: int = 0) -> Schedule:
 
 def _code(number: int) -> list[bool]:
     """Whether the light is on in each step of the marker with this number."""
-    return [True, False, True, *(bool(number >> bit & 1) for bit in range(BITS))]
+    bits = [bool(number >> bit & 1) for bit in range(BITS)]
+    return [True, False, True, *bits, True]
 
 
 @dataclass(frozen=True)
@@ -140,7 +153,7 @@ class _Part:
 
 
 def _parts(steps: Sequence[Step]) -> list[_Part]:
-    """Parts of a schedule with markers; the last one may have no marker after it."""
+    """Parts of a schedule with markers; the last one may lack flashes after it."""
     parts = [_Part()]
     for i, step in enumerate(steps):
         if step.marker and not (i and steps[i - 1].marker):
@@ -183,8 +196,6 @@ def identify_frames(
             markers[_number([steps[i] for i in marker])]
             for marker in (part.before, part.after)
         )
-        if len(part.after) < MARKER:  # the run was stopped
-            end = [len(shots) - len(part.after)]
         gaps = [(a, b) for a, b in product(begin, end) if a < b]
         fitting = [(a, b) for a, b in gaps if b - a - MARKER == len(part.steps)]
         indices = [*part.before, *part.steps, *part.after]
@@ -192,7 +203,7 @@ def identify_frames(
             problem = "the controller reports lost triggers"
         elif len(fitting) == 1:
             [(a, b)] = fitting
-            inside = slice(a, b + len(part.after))
+            inside = slice(a, b + MARKER)
             names = [steps[i].name for i in indices]
             problem = _problem(shots[inside], pictures[inside], names) or _alike(
                 shots[inside], np.array([one.means for one in pictures[inside]]), names
@@ -218,7 +229,7 @@ def _number(marker: Sequence[Step]) -> int:
     """Number of a marker; -1 without some of its flashes."""
     if len(marker) != MARKER:
         return -1
-    return sum((step.light != DARK) << bit for bit, step in enumerate(marker[3:]))
+    return sum((step.light != DARK) << bit for bit, step in enumerate(marker[3:-1]))
 
 
 def _markers(means: Float64) -> Mapping[int, list[int]]:
@@ -226,7 +237,7 @@ def _markers(means: Float64) -> Mapping[int, list[int]]:
     places = defaultdict[int, list[int]](list)
     level = means.sum(axis=-1)
     for begin in range(len(means) - MARKER + 1):
-        on, off, again, *bits = means[begin : begin + MARKER]
+        on, off, again, *bits, last = means[begin : begin + MARKER]
         limit = MAX_DIFFERENCE * np.linalg.norm(on - off)
         from_on, from_off = (
             np.linalg.norm(np.array(bits) - state, axis=1) for state in (on, off)
@@ -234,7 +245,7 @@ def _markers(means: Float64) -> Mapping[int, list[int]]:
         is_on = from_on < limit
         if (
             level[begin] > level[begin + 1]
-            and np.linalg.norm(again - on) < limit
+            and max(np.linalg.norm(again - on), np.linalg.norm(last - on)) < limit
             and (is_on | (from_off < limit)).all()
         ):
             places[int(is_on @ 2 ** np.arange(BITS))].append(begin)
@@ -250,10 +261,13 @@ def _problem(
     first = dict[int, int]()
     for i, picture in enumerate(pictures):
         before = first.setdefault(picture.digest, i)
-        # of a step with the same name, a black frame may be equal, and noise never is
-        if before != i and not (picture.is_even and names[before] == names[i]):
-            files = (shots[before].path.name, shots[i].path.name)
-            return f"{' and '.join(files)} are the same picture"
+        if before == i:
+            continue
+        files = f"{shots[before].path.name} and {shots[i].path.name}"
+        if not picture.is_even:  # noise is never equal
+            return f"{files} are the same picture"
+        if not all(names[j].startswith(f"light {DARK} ") for j in (before, i)):
+            return f"{files} are equally black; set a black level above zero"
     return ""
 
 
@@ -263,9 +277,7 @@ def _alike(shots: Sequence[Shot], means: Float64, names: Sequence[str]) -> str:
     """
     level = np.linalg.norm(means - means[1], axis=1)
     step = np.linalg.norm(np.diff(means, axis=0), axis=1)
-    equal = (step < MIN_DIFFERENCE * level[1:]) & (
-        level[1:] > MAX_DIFFERENCE * level[0]
-    )
+    equal = (step < MIN_DIFFERENCE * level[1:]) & (level[1:] > LIT_FRACTION * level[0])
     for i in np.flatnonzero(equal).tolist():
         if names[i] != names[i + 1]:
             files = (shots[i].path.name, shots[i + 1].path.name)

@@ -57,9 +57,9 @@ PERSON = Subject(
 PLAN = CapturePlan(seconds=2.0, sites=("cheek",))
 ATTACKED_LIGHTS = LIGHTS[::3]
 LONG_BRACKETS = {name: 10 * seconds for name, seconds in BRACKETS.items()}
-# By the simulated clock: four runs of 54 steps, of which 21 are flashes of markers, with
+# By the simulated clock: four runs of 65 steps, of which 32 are flashes of markers, with
 # their uploads, reports and last frames, three placements, and two boards that start.
-MAX_SECONDS = 4 * (56 * 0.3 + 5.0 + 2.0 + 55 * 0.9 + 15.0 + 12.0) + 3 * 45.0 + 2 * 6.0
+MAX_SECONDS = 4 * (67 * 0.3 + 5.0 + 3.0 + 66 * 0.9 + 15.0 + 12.0) + 3 * 45.0 + 2 * 6.0
 ODD_VALUES = (
     *(
         "nan",
@@ -400,10 +400,10 @@ def frame_faults(seed):
     rng = np.random.default_rng([seed, 35])
     count = int(rng.integers(0, 4))
     dropped, repeated = (
-        tuple((str(rng.choice(CAMERAS)), int(rng.integers(54))) for _ in range(count))
+        tuple((str(rng.choice(CAMERAS)), int(rng.integers(65))) for _ in range(count))
         for _ in range(2)
     )
-    line = {"garbage": 0.3, "delay": 0.05, "vanish_after": int(rng.integers(60, 160))}
+    line = {"garbage": 0.3, "delay": 0.05, "vanish_after": int(rng.integers(72, 180))}
     kind = str(rng.choice([*line, "none"]))
     dome = DeviceFaults(**({kind: line[kind]} if kind in line else {}), seed=seed)
     late = float(rng.choice([0.0, 0.5, 12.0]))

@@ -161,8 +161,8 @@ def test_run_capture__more_flashes_than_planned_are_recorded(setup, tmp_path):
             lit = [step for step in device.steps if step.light != DARK]
             late = (
                 0
-                if reply["on"] < lit[2].on_us  # after the first marker
-                else max(lit[7].on_us - int(reply["on"]), 0)
+                if reply["on"] < lit[7].on_us  # after two markers
+                else max(lit[12].on_us - int(reply["on"]), 0)
             )
             return reply | {"on": reply["on"] + late, "off": reply["off"] + late}
 

@@ -21,10 +21,10 @@ from devices_pair import (
 
 from skindb.errors import Fault, InputError
 from skindb.hw.cameras import Shot
-from skindb.hw.frame_markers import INTERVAL
 from skindb.hw.probe import PlacementError
 from skindb.hw.sequence import DARK, assess, plan_schedule, slowed_schedule
 from skindb.hw.session import (
+    DARK_FRAMES,
     capture_dome,
     capture_site,
     require_complete,
@@ -151,7 +151,7 @@ def test_capture_dome__any_frames_may_be_lost(subject, tmp_path):
 
 
 def test_capture_dome__a_camera_that_is_off_is_named(subject, tmp_path):
-    every = tuple(("c1", i) for i in range(9 * len(SCHEDULE.steps)))
+    every = tuple(("c1", i) for i in range(12 * len(SCHEDULE.steps)))
     run = _run(subject, tmp_path, LaboratoryFaults(dropped_frames=every))
     with pytest.raises(
         InputError,
@@ -174,7 +174,7 @@ def test_capture_dome__a_camera_that_is_off_is_named(subject, tmp_path):
             "light l03: must be as bright as the others; found 100% of the current of a light",
         ),
         (DeviceFaults(open_interlock_at=9), "found dome: the interlock was opened"),
-        (DeviceFaults(vanish_after=60), "found dome must "),
+        (DeviceFaults(vanish_after=90), "found dome must "),
     ],
 )
 def test_capture_dome__what_cannot_be_repeated_is_named(
@@ -266,7 +266,7 @@ def test_capture_dome__steps_before_the_controller_vanished_are_kept(subject, tm
     """What it reported while it ran is kept with its measured times; what it did not
     report is taken again.
     """
-    for requests in range(62, 140, 5):  # 59 before the start, then about 90
+    for requests in range(72, 180, 6):  # 70 before the start, then about 105
         run = _run(
             subject,
             tmp_path,
@@ -277,9 +277,9 @@ def test_capture_dome__steps_before_the_controller_vanished_are_kept(subject, tm
         assert {i for _, i in run.frames} <= {
             i for i, done in enumerate(run.measured) if done is not None
         }
-        # the frames between the first two markers
-        if requests > 130:
-            assert len(run.frames) == len(CAMERAS) * INTERVAL
+        # the dark frames, which are between the first two markers
+        if requests > 120:
+            assert len(run.frames) >= len(CAMERAS) * DARK_FRAMES * len(EXPOSURES)
 
 
 @pytest.mark.parametrize("slow", [False, True])
@@ -317,5 +317,7 @@ def test_capture_dome__a_repetition_that_is_refused_loses_nothing(
             override=None if slow else OVERRIDE,
         )
     assert run.stopped == "dome must be armed: the interlock is open"
-    # the part of that camera between two markers
-    assert len(run.frames) == len(CAMERAS) * len(schedule.steps) - INTERVAL
+    # the dark frames of that camera before the lights
+    assert len(run.frames) == len(CAMERAS) * len(schedule.steps) - DARK_FRAMES * len(
+        EXPOSURES
+    )
