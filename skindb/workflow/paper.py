@@ -37,7 +37,8 @@ MAX_FACES = 5  # of figure 11
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 PARTS = ("upper", "lower")  # of the face, in figure 5
 MAX_ROWS = 4  # of figure 19
-TRAITS = ("beard_density", "european", "tan", "lotion")  # of figure 19
+# of figure 19
+TRAITS = ("beard_density", "ancestry:european", "condition:tan", "condition:lotion")
 GROUPS = ["ancestry", "gender"]  # of figure 16
 HISTOGRAM_SURFELS = 2000  # of each take, in figure 16
 PEOPLE = ["condition", *GROUPS]  # rows of table 1
