@@ -105,7 +105,7 @@ def register(
     type=PATH,
     help=(
         "Picture of each trait at half and full strength, drawn instead of storing an "
-        "edit (.png, .pdf, .svg)."
+        "edit (.png, .pdf, .svg), under the light nearest to the frontal camera."
     ),
 )
 @options_of(EditParameters)
