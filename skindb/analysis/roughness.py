@@ -19,7 +19,7 @@ from skindb.types import Array, Index, Mask, finite_rows, float64, lengths, unit
 WAVELENGTHS = (10.0, 25.0)
 SIGMAS = np.sqrt(np.log(2) / 2) / np.pi * np.array(WAVELENGTHS)
 # mm; with fewer surfels, texture of shorter wavelengths appears in the band: a contrast of
-# virtual faces is up to 3 % too large at 1.7 mm, but 50 % at 3.4 mm
+# virtual faces is up to 5 % too large at 1.7 mm, and twice as large at 3.4 mm
 MAX_SPACING = 2.2
 STEP = (
     3.0  # mm between the places of the band, below the smaller Gaussian's width of 4.4
