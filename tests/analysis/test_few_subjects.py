@@ -155,7 +155,7 @@ def test_group_effects__values_of_two_kinds_are_refused_and_mistakes_are_named()
         people, age=years, gender=["male", "Male", "male", "male"] + ["female"] * 4
     )
     notes = coverage_report(cohort).attrs["flags"]
-    assert "age: must be in years, from 0 to 130; found -3.0, 492.0" in notes
+    assert "age: must be in years, from 0 to 130; found -3, 492" in notes
     assert "gender: 'Male' and 'male' count as different values" in notes
 
 
