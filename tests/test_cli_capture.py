@@ -14,6 +14,7 @@ from permissions import open_to_others
 
 from skindb.cli import cli
 from skindb.errors import InputError
+from skindb.format.frames import read_frame
 from skindb.hw.capture_folder import one_session
 from skindb.ingest import read_capture
 from skindb.virtual.devices import RefusedError
@@ -84,8 +85,13 @@ def _same_frames(out, rehearsal):
     assert files == sorted(
         path.relative_to(out) for path in out.glob("dome/frames/*/*")
     )
+    # a picture that is delivered again has new noise with a standard deviation of one
     return all(
-        (out / name).read_bytes() == (rehearsal / name).read_bytes() for name in files
+        np.abs(
+            read_frame(out / name).astype(float) - read_frame(rehearsal / name)
+        ).max()
+        <= 8
+        for name in files
     )
 
 
@@ -128,14 +134,15 @@ def test_capture__lost_frames_only_cost_time(rehearsal, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "fault", ["dome.open_interlock_at=20", "dome.vanish_after=115"]
+    "fault", ["dome.open_interlock_at=60", "dome.vanish_after=215"]
 )
 def test_capture__continues_after_a_stop(rehearsal, tmp_path, fault):
     out, result = _again(rehearsal, tmp_path, "--fault", fault)
     assert isinstance(result.exception, InputError)
     assert "must run to its end" in str(result.exception)
     kept = len(json.loads((out / "unfinished.json").read_text())["sequence"])
-    assert kept == (12 if "interlock" in fault else kept) > 0
+    # between the second and the third marker
+    assert kept == (25 if "interlock" in fault else kept) > 0
     out, result = _again(rehearsal, tmp_path)
     assert result.exit_code == 0, str(result.exception)
     assert _same_frames(out, rehearsal)
@@ -604,12 +611,10 @@ def test_capture__a_gauge_that_fails_ends_the_session(rehearsal, tmp_path, gauge
 
 
 def test_capture__a_controller_without_progress_is_stopped(rehearsal, tmp_path):
-    out, result = _again(rehearsal, tmp_path, "--fault", "dome.frozen_at=20")
-    assert "dome must finish step 20 within 4.7 s: no progress after 4.8 s" in str(
-        result.exception
-    )
+    out, result = _again(rehearsal, tmp_path, "--fault", "dome.frozen_at=60")
+    assert "dome must finish step 60 within" in str(result.exception)
     kept = json.loads((out / "unfinished.json").read_text())["sequence"]
-    assert len(kept) == 20 - 8  # the first eight steps are dark frames
+    assert len(kept) == 25  # between the second and the third marker
     out, result = _again(rehearsal, tmp_path)
     assert result.exit_code == 0, str(result.exception)
     assert _same_frames(out, rehearsal)
@@ -638,8 +643,8 @@ def test_capture__a_slow_sequence_has_the_wanted_length_or_is_refused(
         rehearsal, tmp_path, "--plan", "--slower", "--seconds", "60", "--json"
     )
     plan = json.loads(result.output)
-    assert 60 <= plan["seconds"] <= 64  # with dark frames
-    assert plan["flashes_per_second"] <= 1
+    assert 60 <= plan["seconds"] <= 72  # with dark frames and markers
+    assert plan["flashes_per_second"] <= 3  # of the markers
 
 
 def test_capture__a_capture_of_the_own_dome_can_be_rehearsed(rehearsal, tmp_path):

@@ -25,7 +25,7 @@ from skindb.render.rendering import (
     render_picture,
     sum_over_lights,
 )
-from skindb.render.scene import Camera, Environment, Lights
+from skindb.render.scene import Camera, Environment, Lights, lights_from_dome
 from skindb.schema import variables
 from skindb.store import STUDY, Database, intact_or_none, require_fresh
 from skindb.types import Progress, float64, silent
@@ -315,9 +315,7 @@ def _light(model: DataTree) -> Lights:
     turn = np.radians(LIGHT_DEGREES)
     towards = np.array([np.sin(turn), LIGHT_RISE, np.cos(turn)])
     towards /= np.linalg.norm(towards)
-    power = np.median(model["dome"].dataset[variables.LIGHT_INTENSITY].values, axis=0)[
-        None
-    ]
+    power = np.median(lights_from_dome(model["dome"].dataset).intensity, axis=0)[None]
     return Lights(
         _nose(model)[None] + LIGHT_MM * towards,
         power,

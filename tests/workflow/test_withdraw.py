@@ -419,7 +419,7 @@ def test_withdraw__whatever_a_computation_raises_is_named_and_repeated(
         raise error
 
     with monkeypatch.context() as patch:
-        patch.setattr("skindb.analysis.translucency.translucency_table", fail)
+        patch.setitem(vars(translucency.STUDY), "compute", fail)
         outcomes = _outcomes(workflow.withdraw(db, "A"))
     assert outcomes["population of translucency"].startswith(
         f"cannot be computed by this version: {type(error).__name__}"
@@ -437,15 +437,16 @@ def test_withdraw__while_a_study_is_computed(small, tmp_path, monkeypatch):
     withdrawal.
     """
     db = Database(shutil.copytree(small, tmp_path / "db"))
-    compute = translucency.translucency_table
+    study = vars(translucency.STUDY)
+    compute = study["compute"]
 
-    def suspended(*args, **options):
-        table = compute(*args, **options)
-        monkeypatch.setattr(translucency, "translucency_table", compute)
+    def suspended(*args):
+        table = compute(*args)
+        monkeypatch.setitem(study, "compute", compute)
         Database(db.root).erase("A")
         return table
 
-    monkeypatch.setattr(translucency, "translucency_table", suspended)
+    monkeypatch.setitem(study, "compute", suspended)
     with pytest.raises(
         WithdrawnError, match="A: the subject must not be withdrawn while a version"
     ):
