@@ -8,6 +8,7 @@ from skindb.clock import SYSTEM_CLOCK, Clock
 from skindb.errors import Fault
 from skindb.hw.dome import KIND as DOME
 from skindb.hw.link import (
+    BOOT_SECONDS,
     ERROR,
     EVENT,
     OK,
@@ -64,10 +65,14 @@ class _Device:
         texts = {name: str(value) for name, value in values.items()}
         return Message(REQUEST, self._number, verb, texts).encode()
 
+    def write(self, data: bytes) -> None:
+        """Send a part of a line."""
+        self._port.write(data)
+
     def send(self, line: bytes) -> Message:
         """The reply to a line; without one, a message with the verb "no reply"."""
         begin = self.clock.monotonic()
-        self._port.write(line)
+        self.write(line)
         for message in self.listen(2 * REPLY_SECONDS):
             if message.kind != EVENT:
                 self.slowest = max(self.slowest, self.clock.monotonic() - begin)
@@ -108,7 +113,7 @@ def check_device(port: Port, *, clock: Clock = SYSTEM_CLOCK) -> tuple[str, list[
     """
     device = _Device(port, clock)
     hello = device.ask("HELLO")
-    end = clock.monotonic() + 5.0
+    end = clock.monotonic() + BOOT_SECONDS
     while hello.verb == "no reply" and clock.monotonic() < end:
         hello = device.ask("HELLO")
     kind = hello.values.get("kind", "")
@@ -144,10 +149,10 @@ def _check_lines(device: _Device) -> None:
     reply = device.send(device.line("BEAT")[:-1] + b"\r\n")
     rule = "must ignore a carriage return before the newline"
     device.expect(reply.verb == OK, rule, _found(reply))
-    begin, end = (lambda text: (text[:4], text[4:]))(device.line("BEAT"))
-    device._port.write(begin)
+    line = device.line("BEAT")
+    device.write(line[:4])
     device.expect(
-        device.send(end).verb == OK, "must accept a line in pieces", "no reply"
+        device.send(line[4:]).verb == OK, "must accept a line in pieces", "no reply"
     )
     device.refuses("unknown verb", "DANCE")
     line = device.line("STATUS")

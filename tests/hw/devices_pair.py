@@ -14,6 +14,7 @@ from skindb.hw.dome import Dome
 from skindb.hw.link import Link
 from skindb.hw.probe import Probe
 from skindb.hw.sequence import Override
+from skindb.hw.session import capture_dome
 from skindb.virtual.devices import DeviceFaults, DirectPort, Emulated, EmulatedDome
 from skindb.virtual.laboratory import Laboratory, LaboratoryFaults
 
@@ -108,6 +109,11 @@ class Bench:
         )
         self.cameras = FolderCameras(watched, CAMERAS, clock=self.clock)
         self.probe_camera = FolderCameras(watched, ["probe"], clock=self.clock)
+
+    def capture(self, schedule, **options):
+        """Run a schedule, which an operator confirms by default."""
+        options = {"override": OVERRIDE, "marker_light": LIGHTS[0]} | options
+        return capture_dome(self.dome, self.cameras, schedule, **options)
 
     def __enter__(self) -> Bench:
         return self

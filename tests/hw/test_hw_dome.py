@@ -31,7 +31,7 @@ from skindb.hw.sequence import (
     plan_schedule,
     slowed_schedule,
 )
-from skindb.hw.session import capture_dome, with_dark_frames
+from skindb.hw.session import with_dark_frames
 from skindb.virtual.devices import DeviceFaults, EmulatedDome, RefusedError
 
 SCHEDULE = with_dark_frames(plan_schedule(LIGHTS, EXPOSURES))
@@ -211,13 +211,7 @@ def test_capture_dome__reports_of_steps_that_never_ran_are_not_asked_for(
             return report(values) if step.measured else ready
 
         device._report = any_step
-        run = capture_dome(
-            bench.dome,
-            bench.cameras,
-            SCHEDULE,
-            marker_light=LIGHTS[0],
-            override=OVERRIDE,
-        )
+        run = bench.capture(SCHEDULE)
     assert run.stopped == "dome: the interlock was opened"
     assert max(asked) == 20
     assert [i for i, measured in enumerate(run.measured) if measured is not None] == [
@@ -231,13 +225,7 @@ def test_capture_dome__a_stop_without_a_reason_ends_the_run(subject, tmp_path):
         device.faults = DeviceFaults(open_interlock_at=20)
         status = device._status
         device._status = lambda values: status(values) | {"reason": ""}
-        run = capture_dome(
-            bench.dome,
-            bench.cameras,
-            SCHEDULE,
-            marker_light=LIGHTS[0],
-            override=OVERRIDE,
-        )
+        run = bench.capture(SCHEDULE)
     assert run.stopped == "dome: it gave no reason"
 
 
@@ -251,13 +239,7 @@ def test_capture_dome__current_in_a_dark_frame_is_named(subject, tmp_path):
             return report(values) | ({"level": "0.6"} if dark else {})
 
         device._report = lit
-        run = capture_dome(
-            bench.dome,
-            bench.cameras,
-            SCHEDULE,
-            marker_light=LIGHTS[0],
-            override=OVERRIDE,
-        )
+        run = bench.capture(SCHEDULE)
     assert run.faulty_lights == {DARK: "60% of the current of a light in a dark frame"}
 
 
@@ -275,13 +257,7 @@ def test_capture_dome__wrong_trigger_counts_do_not_exchange_frames(subject, tmp_
             return report(values) | {"triggers": triggers}
 
         device._report = exchanged
-        run = capture_dome(
-            bench.dome,
-            bench.cameras,
-            SCHEDULE,
-            marker_light=LIGHTS[0],
-            override=OVERRIDE,
-        )
+        run = bench.capture(SCHEDULE)
     assert "repeated" in run.notes[-1]
     for (camera, i), path in run.frames.items():
         step = SCHEDULE.steps[i]
@@ -299,12 +275,8 @@ def test_capture_dome__a_folder_of_a_camera_that_is_gone_ends_the_run(
             if done == total:
                 shutil.rmtree(tmp_path / "c1")
 
-        run = capture_dome(
-            bench.dome,
-            bench.cameras,
+        run = bench.capture(
             SCHEDULE,
-            marker_light=LIGHTS[0],
-            override=OVERRIDE,
             progress=unmount,
         )
     assert "must be readable and writable: No such file or directory" in run.stopped

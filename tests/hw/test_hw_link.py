@@ -46,7 +46,7 @@ from skindb.hw.link import (
 )
 from skindb.hw.probe import Probe
 from skindb.hw.sequence import plan_schedule
-from skindb.hw.session import capture_dome, require_complete
+from skindb.hw.session import require_complete
 from skindb.virtual.devices import DeviceFaults, EmulatedDome
 from skindb.virtual.laboratory import LaboratoryFaults
 
@@ -416,12 +416,8 @@ def test_run__emergency_stop_at_any_moment(subject, tmp_path, at):
             if done >= at:
                 raise KeyboardInterrupt
 
-        run = capture_dome(
-            bench.dome,
-            bench.cameras,
+        run = bench.capture(
             slow,
-            marker_light=LIGHTS[0],
-            override=OVERRIDE,
             progress=interrupt,
         )
         assert run.stopped == "stopped by the operator"
@@ -475,13 +471,7 @@ def test_replay__a_recorded_session_gives_the_same_sequence(subject, tmp_path):
     log = tmp_path / "dome.log"
     faults = LaboratoryFaults(dome=DeviceFaults(garbage=0.2))
     with Bench(subject, tmp_path / "frames", faults, log=log) as bench:
-        run = capture_dome(
-            bench.dome,
-            bench.cameras,
-            SCHEDULE,
-            marker_light=LIGHTS[0],
-            override=OVERRIDE,
-        )
+        run = bench.capture(SCHEDULE)
     clock = SimulatedClock()
     again = Dome(Link(ReplayPort(log, clock=clock), "dome", clock=clock))
     marked = with_markers(SCHEDULE, LIGHTS[0])

@@ -43,13 +43,7 @@ def subject(tmp_path_factory):
 
 def _run(subject, watched, faults=None):
     with Bench(subject, watched, faults) as bench:
-        run = capture_dome(
-            bench.dome,
-            bench.cameras,
-            SCHEDULE,
-            marker_light=LIGHTS[0],
-            override=OVERRIDE,
-        )
+        run = bench.capture(SCHEDULE)
         # all lights are off, except one that cannot be switched off
         assert bench.laboratory.dome.on in (None, "l03")
         return run
@@ -309,11 +303,8 @@ def test_capture_dome__a_repetition_that_is_refused_loses_nothing(
             arm(part, override)
 
         monkeypatch.setattr(bench.dome, "arm", refuse_the_second)
-        run = capture_dome(
-            bench.dome,
-            bench.cameras,
+        run = bench.capture(
             schedule,
-            marker_light=LIGHTS[0],
             override=None if slow else OVERRIDE,
         )
     assert run.stopped == "dome must be armed: the interlock is open"

@@ -11,7 +11,6 @@ from devices_pair import (
     CAMERAS,
     EXPOSURES,
     LIGHTS,
-    OVERRIDE,
     Bench,
     emulated_dome,
     is_frame,
@@ -25,7 +24,6 @@ from skindb.hw.dome import Dome
 from skindb.hw.link import ATTEMPTS, READ_SECONDS, REPLY_SECONDS
 from skindb.hw.sequence import DARK, plan_schedule
 from skindb.hw.session import (
-    capture_dome,
     capture_site,
     require_complete,
     with_dark_frames,
@@ -63,13 +61,7 @@ def _outcome(session):
 def _dome_session(subject, watched, delay):
     faults = LaboratoryFaults(dome=DeviceFaults(delay=delay))
     with Bench(subject, watched, faults) as bench:
-        run = capture_dome(
-            bench.dome,
-            bench.cameras,
-            SCHEDULE,
-            marker_light=LIGHTS[0],
-            override=OVERRIDE,
-        )
+        run = bench.capture(SCHEDULE)
         assert bench.clock.monotonic() < MAX_SECONDS
     require_complete(run, CAMERAS)
     return run
