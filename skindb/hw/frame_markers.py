@@ -200,7 +200,7 @@ def identify_frames(
         gaps = [(a, b) for a, b in product(begin, end) if a < b]
         fitting = [(a, b) for a, b in gaps if b - a - MARKER == len(part.steps)]
         indices = [*part.before, *part.steps, *part.after]
-        if lost and not set(indices).isdisjoint(lost):
+        if not set(indices).isdisjoint(lost):
             problem = "the controller reports lost triggers"
         elif len(fitting) == 1:
             [(a, b)] = fitting

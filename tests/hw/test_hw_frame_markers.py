@@ -159,6 +159,11 @@ def test_identify_frames__lost_triggers(tmp_path):
             frames, problems = identify_frames(camera.shots, marked.steps, reported)
             _require_right(frames, camera, {index}, marked)
             assert problems
+    camera = _Camera(tmp_path, _pictures(rng), rng)
+    camera.run(marked)  # as many frames as steps, of which the controller lost one
+    frames, [problem] = identify_frames(camera.shots, marked.steps, [9])
+    assert "lost triggers" in problem
+    assert 9 not in frames
 
 
 def test_identify_frames__a_run_that_was_stopped(tmp_path):
