@@ -510,7 +510,7 @@ def place_at(url: str) -> Place:
             "give a folder, or s3://BUCKET/PREFIX",
         )
     require(
-        Path(url).is_dir() or not Path(url).exists(),
+        not Path(url).exists() or Path(url).is_dir(),  # another process may create it
         url,
         "a database must be a folder",
         "a file",

@@ -17,6 +17,7 @@ import signal
 import sys
 import tempfile
 import time
+import traceback
 from contextlib import suppress
 from pathlib import Path
 
@@ -58,6 +59,9 @@ def start(root: Path, takes: list[str], note: int, seed: int) -> int:
     if not process:
         try:
             write(root, takes, note, seed)
+        except Exception:
+            traceback.print_exc()
+            raise
         finally:
             os._exit(1)
     return process

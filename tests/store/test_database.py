@@ -585,3 +585,21 @@ def test_database__must_be_a_folder(tmp_path):
         ) as caught:
             Database(url)
         assert "secret" not in str(caught.value)
+
+
+@pytest.mark.parametrize("query", ["exists", "is_dir"])
+def test_database__opens_while_another_process_creates_the_folder(
+    tmp_path, monkeypatch, query
+):
+    root = tmp_path / "db"
+    answer = getattr(Path, query)
+
+    def then_created(path):
+        found = answer(path)
+        root.mkdir(exist_ok=True)
+        return found
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, query, then_created)
+        db = Database(root)
+    assert db.takes("capture") == []
