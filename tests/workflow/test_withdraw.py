@@ -10,6 +10,7 @@ import re
 import shutil
 import subprocess
 import sys
+from functools import wraps
 from pathlib import Path
 
 import numpy as np
@@ -415,11 +416,14 @@ def test_withdraw__whatever_a_computation_raises_is_named_and_repeated(
 ):
     db = Database(shutil.copytree(small, tmp_path / "db"))
 
+    study = vars(translucency.STUDY)
+
+    @wraps(study["compute"])  # its digest is that of the original
     def fail(*_, **__):
         raise error
 
     with monkeypatch.context() as patch:
-        patch.setitem(vars(translucency.STUDY), "compute", fail)
+        patch.setitem(study, "compute", fail)
         outcomes = _outcomes(workflow.withdraw(db, "A"))
     assert outcomes["population of translucency"].startswith(
         f"cannot be computed by this version: {type(error).__name__}"
@@ -440,6 +444,7 @@ def test_withdraw__while_a_study_is_computed(small, tmp_path, monkeypatch):
     study = vars(translucency.STUDY)
     compute = study["compute"]
 
+    @wraps(compute)
     def suspended(*args):
         table = compute(*args)
         monkeypatch.setitem(study, "compute", compute)
