@@ -134,7 +134,8 @@ def compare(
 ) -> None:
     """Compare the kept photographs with renderings of the model.
 
-    The measures are RMSE, PSNR, SSIM and CIEDE2000 for each photograph that ingest kept.
+    The measures are RMSE, PSNR, SSIM, CIEDE2000 and the fine contrast (below about 2 mm)
+    over that of the photograph without its noise, for each photograph that ingest kept.
     """
     comparisons = workflow.compare_take(
         existing(db), take, generation=generation, **vars(parameters)
@@ -146,7 +147,14 @@ def compare(
         {name: getattr(c, name) for name in stated} | c.error | {"filled": c.filled}
         for c in comparisons
     ]
-    header = [*stated, "relative_rmse", "psnr", "ssim", "delta_e_median"]
+    header = [
+        *stated,
+        "relative_rmse",
+        "psnr",
+        "ssim",
+        "delta_e_median",
+        "fine_contrast",
+    ]
     rows = [[row[name] for name in header] for row in result]
     emit(result, aligned([header, *rows]))
 

@@ -6,12 +6,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
-from scipy.ndimage import binary_erosion
+from scipy.ndimage import binary_erosion, gaussian_filter
 from skimage.metrics import structural_similarity
 
 from skindb.errors import input_error, require
@@ -43,6 +44,9 @@ Float = Float64
 Image = Array
 # fraction of a pixel's rays that must meet the surface, to exclude silhouettes
 MIN_COVERAGE = 0.999
+# standard deviation of the Gaussian whose result is not fine, at least a pixel
+FINE_MM = 1.0
+MIN_FINE_LEVEL = 0.1  # of the 95 % quantile; darker pixels show noise
 
 
 def compare_images(
@@ -146,6 +150,61 @@ def _ssim(rendered: Float, photographed: Float, inside: Mask) -> float:
     return float(local[centres].mean())
 
 
+def fine_contrast(
+    rendered: Image,
+    photographed: Image,
+    mask: Mask,
+    variance: Image,
+    sigma: float,
+) -> dict[str, float]:
+    """How much of a photograph's fine contrast a rendering has: of what a Gaussian removes
+    from the mean channel, relative to the smoothed photograph.
+
+    Parameters
+    ----------
+    rendered, photographed
+        (h, w, 3) radiance.
+    mask
+        (h, w) pixels to compare; those near its edge and in shadows are left out.
+    variance
+        (h, w) [radiance^2] of the noise of the photograph's mean channel.
+    sigma
+        Standard deviation of the Gaussian [pixel].
+
+    Returns
+    -------
+    dict
+        `fine_contrast`, the standard deviation of the rendering over that of the photograph
+        without its noise, and `fine_gain`, their covariance over the variance of the latter:
+        the part that is in the right place. NaN if there is only noise.
+    """
+    blurred = partial(gaussian_filter, sigma=sigma)
+    weight = blurred(mask.astype(np.float64))
+    ours, theirs = (
+        np.where(mask, np.nan_to_num(image.mean(axis=2, dtype=np.float64)), 0)
+        for image in (rendered, photographed)
+    )
+    covered = np.maximum(weight, 1e-9)
+    level = blurred(theirs) / covered
+    inside = weight > MIN_COVERAGE
+    if not inside.any():
+        return {"fine_contrast": np.nan, "fine_gain": np.nan}
+    inside &= level > MIN_FINE_LEVEL * np.quantile(level[inside], 0.95)
+    fine = [
+        ((image - blurred(image) / covered)[inside] / level[inside])
+        for image in (ours, theirs)
+    ]
+    # of white noise behind the filter: 1 - 2 g(0) + sum of g^2
+    passed = max(1 - 3 / (4 * np.pi * sigma**2), 0.0)
+    noise = passed * (variance[inside] / level[inside] ** 2).mean()
+    (own, common), (_, seen) = np.cov(fine)
+    signal = seen - noise if seen > noise else np.nan
+    return {
+        "fine_contrast": float(np.sqrt(own / signal)),
+        "fine_gain": float(common / signal),
+    }
+
+
 @dataclass(frozen=True)
 class Comparison:
     """One photograph and the model's prediction of it."""
@@ -159,7 +218,7 @@ class Comparison:
     # part of these pixels that shows unfitted surfels, with the values of the nearest fitted
     # ones
     filled: float
-    error: dict[str, float]  # from `compare_images`
+    error: dict[str, float]  # from `compare_images` and `fine_contrast`
     diffuse: Float32  # (h, w, 3) diffuse part of the rendering
 
 
@@ -230,6 +289,9 @@ def _compared(
         name = str(dome["camera"].values[at_camera])
         is_unseen = light in unseen_lights or name in unseen_cameras
         error = compare_images(rendered, photo, mask=mask)
+        noise = _photograph_variance(photo, capture, at_camera)
+        width = camera.pixel_width(view.position.mean(axis=0))
+        error |= fine_contrast(rendered, photo, mask, noise, max(FINE_MM / width, 1))
         filled = view.image(view.interpolate(is_filled[:, None]))[..., 0]
         yield Comparison(
             light,
@@ -252,6 +314,25 @@ def _shaded(
         view, surface, lamp, scene, subsurface=subsurface, terms=("diffuse",)
     )
     return diffuse[0], shade_view(view, surface, lamp, scene, terms=("surface",))[0]
+
+
+def _photograph_variance(photo: Image, capture: xr.DataTree, camera: int) -> Image:
+    """Variance (h, w) of the mean channel [radiance^2]; 0 where the noise is not known."""
+    noise = capture["samples"].to_dataset()
+    names = (
+        variables.RADIANCE_LIMIT,
+        variables.RADIANCE_READ_VARIANCE,
+        variables.RADIANCE_SHOT_VARIANCE,
+    )
+    variance = np.zeros(photo.shape[:2])
+    if not all(name in noise for name in names):
+        return variance
+    limit, read, shot = (noise[name].values[camera] for name in names)
+    for c, radiance in enumerate(np.maximum(np.moveaxis(photo, 2, 0), 0)):
+        # the longest exposure whose limit is not exceeded
+        exposure = np.minimum(np.searchsorted(limit[c], radiance), len(limit[c]) - 1)
+        variance += (read[c][exposure] + shot[c][exposure] * radiance) / 9
+    return variance
 
 
 def _kept_photographs(capture: xr.DataTree) -> list[xr.Dataset]:
