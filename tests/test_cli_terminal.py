@@ -6,9 +6,12 @@ import ast
 import sys
 from pathlib import Path
 
+import pytest
+
 import skindb
-from skindb.cli import _one_line
-from skindb.cli.terminal import Progress, echo
+from skindb.cli import _one_line, cli
+from skindb.cli.shared import aligned
+from skindb.cli.terminal import HelpFormatter, Progress, echo
 from skindb.errors import SkindbWarning
 
 sys.path.insert(0, str(Path(__file__).parent / "store"))
@@ -51,6 +54,44 @@ def test_main__escapes_warnings():
     assert (
         _one_line(HOSTILE, UserWarning, "f.py", 3)
         == f"skindb: warning: f.py:3: UserWarning: {SAFE}\n"
+    )
+
+
+@pytest.mark.parametrize("columns", [20, 60, 80, 200])
+def test_progress__a_bar_fits_the_terminal(capsys, monkeypatch, columns):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", str(columns))
+    progress = Progress("bar")
+    progress.begin_takes(3)
+    progress("samples of the surfels from 2,400 photographs", 1, 2)
+    assert 10 < len(capsys.readouterr().err.strip("\r\n")) < columns
+
+
+def test_aligned__continues_a_wide_table_below_with_its_text_columns():
+    rows = [["site", "channel", "mean", "count"], ["cheek", "R", 0.25, 12]]
+    assert aligned(rows, 30) == [
+        "site   channel  mean  count",
+        "cheek  R        0.25  12",
+    ]
+    assert aligned(rows, 22) == [
+        "site   channel  mean",
+        "cheek  R        0.25",
+        "site   channel  count",
+        "cheek  R        12",
+    ]
+
+
+def test_help__has_a_section_for_each_purpose_and_colour_on_terminals_alone():
+    said = _run("--help").stdout
+    assert "\nSubjects:\n  consent   Show" in said
+    assert {line.split()[0] for line in lines_of(said) if line[:3].strip()} >= set(
+        cli.commands
+    )
+    formatter = HelpFormatter()
+    formatter.write_heading("Options")
+    formatter.write_dl([("--out PATH", "Picture of one take")])
+    assert formatter.getvalue() == (
+        "\x1b[1mOptions\x1b[0m:\n\x1b[36m--out PATH\x1b[0m  Picture of one take\n"
     )
 
 

@@ -21,7 +21,7 @@ from skindb.cli.population import edit, register, reproduce
 from skindb.cli.shared import echo_json, fault_lines
 from skindb.cli.studies import analyze, tidy
 from skindb.cli.subjects import consent, refresh, release, withdraw
-from skindb.cli.terminal import echo
+from skindb.cli.terminal import HelpFormatter, echo
 from skindb.cli.upkeep import audit, backup, clean, info, restore, verify
 from skindb.errors import Fault, InputError, SkindbWarning, escaped, system_fault
 from skindb.files import private_umask
@@ -29,8 +29,36 @@ from skindb.files import private_umask
 INTERRUPTED = 130
 
 
+SECTIONS = {
+    "Try": (demo, simulate, quick),
+    "Laboratory": (calibrate, capture, check_device, landmarks),
+    "Measure": (import_command, ingest, fit, compare, dictionary_command),
+    "Population": (register, analyze, tidy, edit, reproduce),
+    "Pictures": (show, render, view, export),
+    "Subjects": (consent, release, refresh, withdraw),
+    "Database": (info, audit, verify, clean, backup, restore),
+}
+
+
+class Commands(click.Group):
+    """The commands, which the help lists in sections."""
+
+    def format_commands(
+        self,
+        ctx: click.Context,  # noqa: ARG002
+        formatter: click.HelpFormatter,
+    ) -> None:
+        """Write a section for each purpose."""
+        for section, commands in SECTIONS.items():
+            with formatter.section(section):
+                formatter.write_dl(
+                    [(one.name or "", one.get_short_help_str(100)) for one in commands]
+                )
+
+
 @click.group(
-    context_settings={"help_option_names": ["-h", "--help"], "show_default": True}
+    cls=Commands,
+    context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
 )
 @click.version_option(skindb.__version__, prog_name="skindb")
 def cli() -> None:
@@ -39,40 +67,10 @@ def cli() -> None:
     """
 
 
-for _command in (
-    demo,
-    simulate,
-    calibrate,
-    capture,
-    check_device,
-    landmarks,
-    quick,
-    import_command,
-    ingest,
-    fit,
-    dictionary_command,
-    analyze,
-    tidy,
-    register,
-    reproduce,
-    edit,
-    render,
-    compare,
-    show,
-    export,
-    view,
-    consent,
-    release,
-    refresh,
-    withdraw,
-    info,
-    audit,
-    verify,
-    clean,
-    backup,
-    restore,
-):
-    cli.add_command(_command)
+click.Context.formatter_class = HelpFormatter
+for _commands in SECTIONS.values():
+    for _command in _commands:
+        cli.add_command(_command)
 
 
 def _give_up(code: int, faults: Sequence[Fault], results: Any = None) -> NoReturn:

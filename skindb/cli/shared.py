@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from itertools import repeat
+from itertools import repeat, takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -21,7 +21,7 @@ import click
 import skindb
 from skindb import workflow
 from skindb.cli.options import asked
-from skindb.cli.terminal import Progress, echo
+from skindb.cli.terminal import Progress, echo, terminal_width
 from skindb.errors import (
     Fault,
     InputError,
@@ -110,16 +110,29 @@ def echo_json(value: Any) -> None:
     echo(*json.dumps(plain(value), indent=1, allow_nan=False).splitlines())
 
 
-def aligned(rows: list[list[Any]]) -> list[str]:
-    """Format rows as aligned columns, with numbers to three significant digits."""
+def aligned(rows: list[list[Any]], width: int | None = None) -> list[str]:
+    """Format rows as aligned columns, with numbers to three significant digits.
+
+    A table that is wider than the terminal, or than `width`, continues below, with its
+    columns of text again.
+    """
     text = [
         [f"{c:.3g}" if isinstance(c, float) else str(c) for c in row] for row in rows
     ]
-    widths = [max(len(row[i]) for row in text) for i in range(len(text[0]))]
+    widths = [max(map(len, column)) for column in zip(*text, strict=True)]
+    labels = list(takewhile(lambda i: isinstance(rows[-1][i], str), range(len(widths))))
+    width = width or terminal_width()
+    parts = [labels]
+    for i in range(len(labels), len(widths)):
+        if (
+            sum(widths[j] + 2 for j in [*parts[-1], i]) > width + 2
+            and parts[-1] != labels
+        ):
+            parts.append(labels)
+        parts[-1] = [*parts[-1], i]
     return [
-        "  ".join(
-            cell.ljust(width) for cell, width in zip(row, widths, strict=True)
-        ).rstrip()
+        "  ".join(row[i].ljust(widths[i]) for i in part).rstrip()
+        for part in parts
         for row in text
     ]
 

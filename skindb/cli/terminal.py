@@ -7,7 +7,9 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from shutil import get_terminal_size
 
 import click
 
@@ -17,12 +19,32 @@ from skindb.errors import escaped
 MIN_INTERVAL_S = {"bar": 0.2, "json": 1.0}  # between two reports of the same stage
 
 
+class HelpFormatter(click.HelpFormatter):
+    """Help with bold headings, and names of commands and options in colour."""
+
+    def write_heading(self, heading: str) -> None:
+        """Write the title of a section."""
+        super().write_heading(click.style(heading, bold=True))
+
+    def write_dl(
+        self, rows: Iterable[tuple[str, str]], col_max: int = 26, col_spacing: int = 2
+    ) -> None:
+        """Write names and what they mean as two columns."""
+        coloured = [(click.style(name, fg="cyan"), text) for name, text in rows]
+        super().write_dl(coloured, col_max, col_spacing)
+
+
 def echo(*lines: str, err: bool = False) -> None:
     """Print lines on standard output or standard error; a line break inside of a line
     is escaped, too.
     """
     for line in lines:
         click.echo(escaped(line), err=err)
+
+
+def terminal_width() -> int:
+    """Columns of the terminal; of a file or a pipe, as many as a line has."""
+    return get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
 
 
 def redraw(text: str, *, ends_line: bool) -> None:
@@ -134,13 +156,17 @@ class Progress:
 
     def _bar(self) -> None:
         steps = self.steps
-        bar = "#" * round(24 * steps.done / max(steps.total, 1))
         stage = self.stage
         if self.takes.total > 1:
             stage = f"take {self.takes.done + 1} of {self.takes.total}: {stage}"
         left = steps.seconds_left or 0
         count = f"{steps.done}/{steps.total} {left:4.0f} s left"
-        text = f"{stage:<44.44} [{bar:<24}] {count}"
+        # the last column stays empty, as some terminals begin a new line after it
+        free = min(get_terminal_size().columns, 90) - len(count) - 5
+        cells = max(free // 3, 0)
+        bar = "#" * round(cells * steps.done / max(steps.total, 1))
+        name = max(free - cells, 0)
+        text = f"{stage:<{name}.{name}} [{bar:<{cells}}] {count}"
         redraw(text, ends_line=steps.done >= steps.total)
 
     def _line(self, stage: str, steps: Count) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
@@ -73,27 +74,79 @@ def info(db: str, where: str | None, release: str | None) -> None:
 
 
 def _info_lines(database: Database, result: Json, *, details: bool) -> list[str]:
-    """One line for each take and kind, and the details of each."""
-    lines = []
-    parts = [
+    """A row for each take, with the versions of its kinds, and one for each study and
+    the like; with details, lines for each version.
+    """
+    others = [
         part
-        for name in ("takes", "studies", "releases", "calibrations", "consents")
+        for name in ("studies", "releases", "calibrations", "consents")
         for part in result.get(name, {}).items()
     ]
-    for take, kinds in parts:
+    if details:
+        return _version_lines(database, [*result["takes"].items(), *others])
+    takes = result["takes"]
+    kinds = sorted({kind for versions in takes.values() for kind in versions})
+    rows = [["take", "created", "MB", *kinds]]
+    for take, versions in takes.items():
+        cells = {kind: _cells(version) for kind, version in versions.items()}
+        created = max(cell[2] for cell in cells.values())
+        size = sum(float(cell[1]) for cell in cells.values())
+        states = (cells[kind][0] if kind in cells else "-" for kind in kinds)
+        rows.append([take, created, f"{size:.1f}", *states])
+    lines = aligned(rows) if takes else []
+    rows = [
+        [name, kind, *_cells(version)]
+        for name, kinds in others
+        for kind, version in kinds.items()
+    ]
+    if rows:
+        lines += aligned([["name", "kind", "version", "MB", "created", ""], *rows])
+    if any(cell.endswith("*") for row in rows for cell in row):
+        lines.append("* out of date: skindb refresh computes it again")
+    used = Counter(
+        line
+        for versions in takes.values()
+        for line in calibrated_by_lines(versions.get("capture", {}))
+    )
+    lines += [f"{line}: {count} takes" for line, count in used.items()]
+    return lines + [
+        version["fault"]
+        for versions in takes.values()
+        for version in versions.values()
+        if "fault" in version
+    ]
+
+
+def _cells(version: Json) -> list[str]:
+    """Number with a star if out of date, size, date and note of a version."""
+    if "fault" in version:
+        return ["damaged", "0", "-", version["fault"]]
+    star = "*" if version.get("stale") else ""
+    return [
+        f"{version['generation']}{star}",
+        f"{version['bytes'] / 1e6:.1f}",
+        version["created"][:10],
+        ", ".join(version.get("scope", ())) or "none" if "scope" in version else "",
+    ]
+
+
+def _version_lines(database: Database, parts: Iterable[tuple[str, Json]]) -> list[str]:
+    """A line for each version, with its path in the database, and its details."""
+    lines = []
+    for name, kinds in parts:
         for kind, version in kinds.items():
-            text = version.get("fault") or (
-                f"{version['generation']:3d}  {version['bytes'] / 1e6:8.1f} MB  "
-                f"{version['created']}  {version['path']}"
+            text = version.get("fault") or "  ".join(
+                [
+                    *_cells(version),
+                    "data/" + version["path"].rpartition("/data/")[2],
+                ]
             )
-            if "scope" in version:
-                text += f"  {', '.join(version['scope']) or 'none'}"
             if version.get("stale"):
                 text += f"  out of date: {version['stale'][0]}"
-            lines.append(f"{take:<16} {kind:<10} {text}")
+            lines.append(f"{name}  {kind}  {text}")
             lines += indented(calibrated_by_lines(version))
-            if kind in DETAILS and "fault" not in version and details:
-                lines += indented(_details(database, kind, take))
+            if kind in DETAILS and "fault" not in version:
+                lines += indented(_details(database, kind, name))
     return lines
 
 
