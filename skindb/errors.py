@@ -8,6 +8,7 @@ import errno
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
@@ -59,6 +60,13 @@ def few_names(names: Sequence[str], count: int = 3, separator: str = ", ") -> st
     """Names for a message: the first ones, and how many more there are."""
     rest = len(names) - count
     return separator.join(names[:count]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def choices(name: str, known: Iterable[str], verb: str = "choose") -> str:
+    """The cure for an unknown name: the known names, behind the most similar one."""
+    near = get_close_matches(name.lower(), known := sorted(known), n=1)
+    hint = f"did you mean {near[0]}? " if near else ""
+    return f"{hint}{verb} {', '.join(known) or 'none'}"
 
 
 def escaped(text: str) -> str:

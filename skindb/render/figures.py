@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
-from skindb.errors import input_error
+from skindb.errors import InputError, choices, input_error
 from skindb.files import private_file
 from skindb.geometry.mesh import face_crosses
 from skindb.geometry.rays import RayScene
@@ -210,13 +210,7 @@ def write_field(
         honour_consent(version.attrs, "export")
     having = [kind for kind, tree in trees.items() if variable in _drawable(tree)]
     if not having:
-        names = ", ".join(sorted(set().union(*map(_drawable, trees.values()))))
-        raise input_error(
-            "variable",
-            "must be a variable of the surfels",
-            variable,
-            f"choose {names}",
-        )
+        raise _not_drawable(variable, trees.values())
     tree = trees[having[0]]
     figure = field_figure(tree, variable, at=at)
     figure.savefig(private_file(out), dpi=DPI)
@@ -307,8 +301,12 @@ def _find(take: xr.DataTree, variable: str) -> tuple[xr.Dataset, xr.DataArray]:
             return next(g for g in groups if variables.SURFEL_POSITION in g), group[
                 variable
             ]
-    cure = "choose " + ", ".join(sorted(_drawable(take)))
-    raise input_error("variable", "must be a variable of the surfels", variable, cure)
+    raise _not_drawable(variable, [take])
+
+
+def _not_drawable(variable: str, takes: Iterable[xr.DataTree]) -> InputError:
+    cure = choices(variable, set().union(*map(_drawable, takes)))
+    return input_error("variable", "must be a variable of the surfels", variable, cure)
 
 
 def _drawable(take: xr.DataTree) -> set[str]:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from xarray import Dataset, Variable
 
-from skindb.errors import Fault, InputError, few_names, require, require_none
+from skindb.errors import Fault, InputError, choices, few_names, require, require_none
 from skindb.schema.label import label, text_labels
 from skindb.schema.notes import note
 from skindb.schema.variables import VARIABLES
@@ -216,9 +216,13 @@ def combine(
     available = list(dict.fromkeys(name for part in layouts for name in part.variables))
     chosen = available if variables is None else list(dict.fromkeys(variables))
     if unknown := [name for name in chosen if name not in available]:
-        cure = f"choose from {', '.join(sorted(available)) or 'none'}"
         raise InputError(
-            Fault(f"variable {name}", "a cohort has it", "no take with it", cure)
+            Fault(
+                f"variable {name}",
+                "a cohort has it",
+                "no take with it",
+                choices(name, available),
+            )
             for name in unknown
         )
     labels = _all_labels(layouts, chosen)

@@ -17,6 +17,7 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 from zarr.codecs import BloscCodec, BytesCodec
 
+from skindb.errors import choices, input_error
 from skindb.schema.label import BLOCK_SURFELS
 from skindb.store.place import BLOCK_BYTES, Place
 from skindb.store.record import Record
@@ -121,7 +122,15 @@ def open_group(place: Place, record: Record, group: str) -> Dataset:
     """One group of a version, without opening the others."""
     store: Any = VerifiedStore(place, record)
     options: dict[str, Any] = {"engine": "zarr", "consolidated": True, "chunks": None}
-    return _lazy(store, group, open_dataset(store, group=group, **options))
+    try:
+        return _lazy(store, group, open_dataset(store, group=group, **options))
+    except KeyError as error:
+        raise input_error(
+            f"{record.kind} of {record.take}",
+            f"its version {record.generation} must have the group {group}",
+            "none",
+            choices(group, record.contents),
+        ) from error
 
 
 def _lazy(store: VerifiedStore, group: str, ds: Dataset) -> Dataset:

@@ -7,7 +7,6 @@ neither true nor false.
 """
 
 import ast
-import difflib
 import operator
 import re
 import unicodedata
@@ -18,7 +17,7 @@ from datetime import UTC, date, datetime
 from itertools import pairwise
 from typing import Any
 
-from skindb.errors import InputError, input_error
+from skindb.errors import InputError, choices, input_error
 
 MAX_CHARACTERS = 1_000
 MAX_DEPTH = 16  # of nested conditions
@@ -148,14 +147,10 @@ class _Evaluation:
         text = name
         if not name.isascii():
             text += f" ({name.encode('ascii', 'backslashreplace').decode()})"
-        near = difflib.get_close_matches(
-            name.lower(), [*self.columns, "True", "False"], n=1
-        )
-        hint = f"did you mean {near[0]}? " if near else ""
         raise self.fault(
             "must name columns of the catalogue",
             f"the name {text}",
-            f"{hint}Text needs quotes; columns: {', '.join(self.columns)}",
+            f"{choices(name, [*self.columns, 'True', 'False'])}; text needs quotes",
         )
 
     def literal(self, node: ast.expr) -> Any:

@@ -174,7 +174,7 @@ def test_evaluate__hostile_expressions_are_refused_in_one_line_or_harmless(
             "\u0430ge > 40",
             r"found the name \u0430ge \(\\u0430ge\) in .*; did you mean age\?",
         ),
-        ("condition == lotion", "Text needs quotes"),
+        ("condition == lotion", "text needs quotes"),
         (
             "age > '40'",
             (

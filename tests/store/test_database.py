@@ -43,6 +43,9 @@ def test_read__gives_back_what_was_written(tmp_path):
         part["surfels"].to_dataset().compute(), tree["surfels"].to_dataset().compute()
     )
     assert part.attrs == tree.attrs
+    cure = "did you mean surfels[?] choose .*samples"
+    with pytest.raises(InputError, match=f"must have the group surfals; .*{cure}"):
+        Database(tmp_path).read("capture", "A1", groups=["surfals"])
     # without skindb
     plain = xr.open_datatree(tmp_path / record.path, engine="zarr", consolidated=False)
     assert float(plain["surfels/surfel_area"][1]) == 0.5
