@@ -6,7 +6,10 @@ import shutil
 from pathlib import Path
 
 import click
+from docutils import nodes
+from latex2mathml.converter import convert
 from sphinx.application import Sphinx
+from sphinx.writers.html5 import HTML5Translator
 
 import skindb
 from skindb.cli import cli
@@ -47,6 +50,7 @@ myst_heading_anchors = 4
 nb_execution_mode = "off"  # .ci/run_notebooks.py runs them and stores their outputs
 nb_merge_streams = True
 
+html_math_renderer = "mathml"  # browsers draw it without scripts and without a network
 html_theme = "pydata_sphinx_theme"
 html_title = f"skindb {release}"
 html_static_path = ["_static"]
@@ -113,6 +117,16 @@ def _write_commands() -> None:
         page.write_text(text, encoding="utf-8")
 
 
+def _inline(page: HTML5Translator, node: nodes.math) -> None:
+    page.body.append(convert(node.astext()))
+    raise nodes.SkipNode
+
+
+def _block(page: HTML5Translator, node: nodes.math_block) -> None:
+    page.body.append(convert(node.astext(), display="block"))
+    raise nodes.SkipNode
+
+
 def _prepare(app: Sphinx) -> None:
     del app
     _copy_notebooks()
@@ -121,5 +135,6 @@ def _prepare(app: Sphinx) -> None:
 
 def setup(app: Sphinx) -> None:
     """Copy and generate pages before Sphinx looks for sources."""
+    app.add_html_math_renderer("mathml", (_inline, None), (_block, None))
     # before autosummary reads the sources
     app.connect("builder-inited", _prepare, priority=100)

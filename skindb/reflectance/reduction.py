@@ -160,10 +160,10 @@ def truncation_bound(table: Table, reduced: Table, lift: Array) -> float:
     Notes
     -----
     Let e_j = b_j - (reduced lift)_j. The ratio of two sums over j is at most the
-    largest ratio of their terms. As |sum x_j b_j| >= sum x_j <u, b_j> for every unit
-    vector u, |sum x_j e_j| / |sum x_j b_j| is at most max_j |e_j| / <u, b_j>. The best u
-    points to the point nearest to 0 of the simplex of all b_j / |e_j|, which the method
-    of Frank and Wolfe approaches; every step gives a bound.
+    largest ratio of their terms. As ``|sum x_j b_j| >= sum x_j <u, b_j>`` for every unit
+    vector u, ``|sum x_j e_j| / |sum x_j b_j|`` is at most ``max_j |e_j| / <u, b_j>``. The
+    best u points to the point nearest to 0 of the simplex of all ``b_j / |e_j|``, which
+    the method of Frank and Wolfe approaches; every step gives a bound.
     """
     error = (table - reduced @ lift).astype(np.float32)
     if not error.any():
