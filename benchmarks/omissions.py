@@ -20,10 +20,16 @@ from benchmarks.rendering import sky
 from skindb.geometry.rays import RayScene
 from skindb.optics.angles import directions
 from skindb.reflectance.mixture import Mixture
-from skindb.render.monte_carlo import Lighting, Quality, render_monte_carlo
+from skindb.render.monte_carlo import Quality, render_monte_carlo
 from skindb.render.plan import plan_scene
 from skindb.render.rendering import chosen_camera
-from skindb.render.scene import Camera, Environment, from_model, lights_from_dome
+from skindb.render.scene import (
+    Camera,
+    Environment,
+    Lighting,
+    from_model,
+    lights_from_dome,
+)
 from skindb.render.shading import trace_view
 
 DIRECTIONS = 300  # of views around the face

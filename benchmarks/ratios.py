@@ -42,9 +42,9 @@ from skindb.format.folder import read_capture
 from skindb.numerics.inference import permutation_p
 from skindb.parameters import SimulationParameters
 from skindb.render.image import write_exr
-from skindb.render.monte_carlo import Lighting, Quality, render_monte_carlo
+from skindb.render.monte_carlo import Quality, render_monte_carlo
 from skindb.render.rendering import chosen_camera
-from skindb.render.scene import from_model
+from skindb.render.scene import Lighting, from_model
 from skindb.virtual.capture import simulate_takes
 from skindb.workflow import ingest_take, register_takes, study
 from skindb.workflow.derive import groups_of

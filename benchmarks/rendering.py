@@ -21,10 +21,16 @@ import numpy as np
 import skindb
 from skindb.geometry.rays import RayScene
 from skindb.render.image import write_exr
-from skindb.render.monte_carlo import Lighting, Quality, render_monte_carlo
+from skindb.render.monte_carlo import Quality, render_monte_carlo
 from skindb.render.plan import plan_scene
 from skindb.render.rendering import chosen_camera
-from skindb.render.scene import Environment, Lights, from_model, lights_from_dome
+from skindb.render.scene import (
+    Environment,
+    Lighting,
+    Lights,
+    from_model,
+    lights_from_dome,
+)
 
 REFERENCE = 1024  # rays per pixel
 SAMPLES = (16, 64, 256)

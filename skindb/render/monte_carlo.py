@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any
 
@@ -12,23 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.geometry.rays import RayScene
-from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.model import Lamp, Points
-from skindb.reflectance.sampling import TableSampler, tangents
-from skindb.render.scene import Camera, Environment, Lights, Surface
+from skindb.reflectance.sampling import TableSampler
+from skindb.render.scene import Camera, Environment, Lighting, Lights, Surface
 from skindb.render.shading import (
     View,
     bounced_exitance,
     escape_factor,
-    exitance_from_irradiance,
-    received_light,
+    points_on_discs,
     seen_points,
     trace_view,
     transmitted_irradiance,
 )
-from skindb.types import Array, Float32, Index, Mask, Progress, dots, float64, lengths
+from skindb.render.subsurface import FAR, Image, RunningMean, subsurface_light
+from skindb.types import Array, Index, Mask, Progress, dots, float64, lengths
 
-Image = Float32
 # rays per pixel and axis in one batch; random numbers are stratified over the rays of a
 # pixel. Environments need more
 RAYS_PER_AXIS = 2
@@ -37,22 +35,11 @@ RAYS_PER_AXIS_ENVIRONMENT = 4
 MIN_BATCHES = 8
 # rays per pixel at which rendering ends even if the target error is not reached
 MAX_SAMPLES = 4096
-# directions of an environment at each vertex in one batch, for subsurface light
-VERTEX_SAMPLES = 32
-FAR = 1e5  # mm, length of shadow rays towards an environment
 LIGHTS_PER_RAY = 4  # lights drawn for each ray; with fewer lights, all are used
 CELLS = 16  # of normals along each axis
 # in probabilities, because normals of a cell differ by up to 0.1, and for the discs of
 # lights
 MIN_COSINE = 0.02
-
-
-@dataclass(frozen=True)
-class Lighting:
-    """Lights of a dome, an environment, or both."""
-
-    lights: Lights | None = None
-    environment: Environment | None = None
 
 
 @dataclass(frozen=True)
@@ -84,42 +71,6 @@ class Rendering:
     samples: int
     relative_error: float
     seconds: float
-
-
-@dataclass
-class _Sums:
-    """Running mean and sum of squared deviations over batches (Welford 1962)."""
-
-    count: int = 0
-    mean: Any = 0.0
-    square: Any = 0.0
-    coverage: Any = 0.0
-    started: float = field(default_factory=perf_counter)
-
-    def add(self, image: Image, coverage: Image) -> None:
-        self.count += 1
-        apart = image - self.mean
-        self.mean = self.mean + apart / self.count
-        self.square = self.square + apart * (image - self.mean)
-        self.coverage = self.coverage + (coverage - self.coverage) / self.count
-
-    def reached(self, error: float | None) -> bool:
-        """Whether there are enough batches for this relative error."""
-        if error is None or self.count < MIN_BATCHES:
-            return False
-        return self.relative_error() <= error
-
-    def relative_error(self) -> float:
-        if self.count < 2:
-            return np.inf
-        seen = self.coverage > 0
-        level = float(np.mean(np.square(self.mean[seen]))) if seen.any() else 0.0
-        spread = (
-            float(np.mean(self.square[seen])) / (self.count * (self.count - 1))
-            if seen.any()
-            else 0.0
-        )
-        return float(np.sqrt(spread / level)) if level > 0 else 0.0
 
 
 def render_monte_carlo(
@@ -160,7 +111,13 @@ def render_monte_carlo(
         Radiance in the unit of the lights' intensity per mm2, or in that of the environment.
     """
     rays = RayScene(surface.vertices, surface.faces) if scene is None else scene
+    sums = RunningMean()
     painter = _Painter.of(surface, rays, lighting, quality)
+    if quality.subsurface and "diffuse" in quality.terms:
+        view = trace_view(
+            surface, camera, samples=RAYS_PER_AXIS, scene=rays, pixels=pixels
+        )
+        painter, sums.more = painter.with_subsurface_light(view, rng)
     axis = RAYS_PER_AXIS
     enough = quality.samples >= 2 * RAYS_PER_AXIS_ENVIRONMENT**2
     if lighting.environment is not None and enough:
@@ -170,18 +127,20 @@ def render_monte_carlo(
     limit = max(quality.samples, 2 * per_batch)
     if quality.error is not None:
         limit = MAX_SAMPLES
-    sums = _Sums()
-    while sums.count * per_batch < limit and not sums.reached(quality.error):
+    while sums.count * per_batch < limit and (
+        quality.error is None
+        or sums.count < MIN_BATCHES
+        or sums.relative_error() > quality.error
+    ):
         view = trace_view(
             surface, camera, samples=axis, scene=rays, rng=rng, pixels=pixels
         )
         sums.add(painter.batch(view, rng), view.coverage)
         if progress is not None:
             progress("render", min(sums.count * per_batch, limit), limit)
-    variance = sums.square / (sums.count * (sums.count - 1))
     return Rendering(
         np.asarray(sums.mean, np.float32),
-        np.asarray(variance, np.float32),
+        np.asarray(sums.variance(), np.float32),
         np.asarray(sums.coverage, np.float32),
         sums.count * per_batch,
         sums.relative_error(),
@@ -200,9 +159,9 @@ class _Painter:
     lobes: TableSampler
     weights: Array  # (v, k) of the lobes
     choice: LightChoice | None  # None without lights
-    # (v, 3) `bounced_exitance` by the lights, from their centres: shadows of discs do not
-    # matter for it
-    bounced: Array | None
+    # (v, 3) under the boundary, which is interpolated: subsurface light, and `bounced_exitance`
+    # by the lights, from their centres, as shadows of discs do not matter for it
+    exitance: Array | None
 
     @classmethod
     def of(
@@ -214,20 +173,42 @@ class _Painter:
             middle = surface.vertices.mean(axis=0)
             choice = LightChoice.of_lights(lights, middle)
         bounced = None
-        if lights is not None and surface.inter_reflection:
+        diffuse = "diffuse" in quality.terms
+        if lights is not None and surface.inter_reflection and diffuse:
             received = transmitted_irradiance(surface, lights, scene)
             bounced = bounced_exitance(surface, received @ lights.intensity)
         tables, weights = surface.model.resample(surface.parameters)
         lobes = TableSampler.of_tables(tables)
         return cls(surface, scene, lighting, quality, lobes, weights, choice, bounced)
 
+    def with_subsurface_light(
+        self, view: View, rng: np.random.Generator
+    ) -> tuple[_Painter, Image]:
+        """A painter with subsurface light where the view shows the surface, and the variance
+        (h, w, 3) that it adds to the picture.
+        """
+        error = self.quality.error
+        light, spread = subsurface_light(
+            self.surface,
+            self.lighting,
+            self.scene,
+            view.shown(len(self.surface.vertices)),
+            tolerance=self.quality.tolerance,
+            error=None if error is None else error / 2,
+            rng=rng,
+        )
+        if self.exitance is not None:
+            light = light + self.exitance
+        # errors of neighbours go together, so that the mean over a pixel does not reduce them
+        spread = escape_factor(view, self.surface.eta) * view.interpolate(spread)
+        return replace(self, exitance=light), np.square(view.image(spread))
+
     def batch(self, view: View, rng: np.random.Generator) -> Image:
         """One independent estimate of the picture (h, w, 3)."""
         surface = self.surface
         terms = self.quality.terms
-        subsurface = self.quality.subsurface and "diffuse" in terms
         values = np.zeros((len(view.pixel), 3))
-        local = float("diffuse" in terms and not subsurface)
+        local = float("diffuse" in terms and not self.quality.subsurface)
         diffuse = view.interpolate(surface.diffuse) * local
         with_surface = "surface" in terms
         points = seen_points(view, surface, diffuse, with_surface=with_surface)
@@ -236,18 +217,8 @@ class _Painter:
             values += self._by_lights(hits, self.choice, rng)
         if self.lighting.environment is not None:
             values += self._by_environment(hits, self.lighting.environment, rng)
-        exitances = []
-        if subsurface:
-            shown = view.shown(len(surface.vertices))
-            received = self._received(rng)
-            tolerance = self.quality.tolerance
-            exitances += [
-                exitance_from_irradiance(surface, received, shown, tolerance=tolerance)
-            ]
-        if self.bounced is not None and "diffuse" in terms:
-            exitances += [self.bounced]
-        for exitance in exitances:
-            values += escape_factor(view, surface.eta) * view.interpolate(exitance)
+        if self.exitance is not None:
+            values += escape_factor(view, surface.eta) * view.interpolate(self.exitance)
         return view.image(values)
 
     def _by_lights(
@@ -323,63 +294,6 @@ class _Painter:
             shaded = hits.shade(rows, view.position[rows] + towards[rows], weight)
             values[rows] += shaded * environment.along(towards[rows])
         return values
-
-    def _received(self, rng: np.random.Generator) -> Array:
-        """Irradiance (v, 3) under the boundary, F_t(w_i) E, at the vertices; an
-        independent estimate in each batch.
-        """
-        surface = self.surface
-        points = surface.vertices
-        normals = surface.normals
-        received = np.zeros((len(points), 3))
-        if (lights := self.lighting.lights) is not None:
-            for i in range(len(lights)):
-                place = points_on_discs(lights, np.full(len(points), i), rng)
-                light = received_light(
-                    lights, i, place, points, normals, self.scene, surface.eta
-                )
-                received += light[:, None] * lights.intensity[i]
-        if self.lighting.environment is not None:
-            received += self._received_from_environment(
-                points, normals, self.lighting.environment, rng
-            )
-        return received
-
-    def _received_from_environment(
-        self,
-        points: Array,
-        normals: Array,
-        environment: Environment,
-        rng: np.random.Generator,
-    ) -> Array:
-        """Half of the directions are drawn by luminance, half by the cosine (balance
-        heuristic, Veach 1997).
-        """
-        received = np.zeros((len(points), 3))
-        tangent, second = tangents(normals)
-        for i in range(VERTEX_SAMPLES):
-            if i % 2:
-                towards = environment.sample(rng.random((len(points), 2)))
-            else:
-                height = np.sqrt(rng.random(len(points)))
-                turn = 2 * np.pi * rng.random(len(points))
-                sine = np.sqrt(1 - height**2)
-                towards = (sine * np.cos(turn))[:, None] * tangent + (
-                    sine * np.sin(turn)
-                )[:, None] * second
-                towards += height[:, None] * normals
-            cosine = dots(towards, normals)
-            front = np.flatnonzero(cosine > 0)
-            target = points[front] + FAR * towards[front]
-            lit = front[
-                ~self.scene.occluded(points[front], target, normal=normals[front])
-            ]
-            density = (environment.pdf(towards[lit]) + cosine[lit] / np.pi) / 2
-            passed = fresnel_transmittance(np.minimum(cosine[lit], 1), self.surface.eta)
-            received[lit] += (cosine[lit] * passed / density)[
-                :, None
-            ] * environment.along(towards[lit])
-        return received / VERTEX_SAMPLES
 
 
 @dataclass(frozen=True)
@@ -492,14 +406,3 @@ def stratified(view: View, rng: np.random.Generator) -> Array:
 def _shuffled(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.intp]:
     """Random orders along the last axis."""
     return rng.random(shape, np.float32).argsort(axis=-1)
-
-
-def points_on_discs(lights: Lights, chosen: Index, rng: np.random.Generator) -> Array:
-    """Points (n, 3) drawn uniformly on the discs of the chosen lights (n,)."""
-    tangent, second = tangents(float64(lights.axis))
-    radius = lights.disc_radius[chosen] * np.sqrt(rng.random(len(chosen)))
-    turn = 2 * np.pi * rng.random(len(chosen))
-    across = (
-        np.cos(turn)[:, None] * tangent[chosen] + np.sin(turn)[:, None] * second[chosen]
-    )
-    return lights.position[chosen] + radius[:, None] * across

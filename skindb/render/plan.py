@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from skindb.geometry.rays import RayScene
-from skindb.render.monte_carlo import Lighting
-from skindb.render.scene import Camera, Lights, Surface
+from skindb.render.scene import Camera, Lighting, Lights, Surface
 from skindb.render.shading import View, trace_view, tree_opening
 from skindb.schema.notes import Omission
 from skindb.types import Mask, dots
@@ -64,7 +63,7 @@ def plan_scene(
         # light still comes from all vertices, and the picture is interpolated between
         # the visible ones, so that it stays the same
         shown = view.shown(len(surface.vertices))
-        what = "surfels that receive subsurface light"
+        what = "vertices that receive subsurface light"
         if hidden := int((~shown).sum()):
             skipped += (Omission(what, hidden, shown.size, "they are not visible"),)
     model, parameters, omissions = surface.model.simplified(surface.parameters)

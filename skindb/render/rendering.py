@@ -16,17 +16,17 @@ from skindb.errors import require
 from skindb.geometry.rays import RayScene
 from skindb.parameters import RenderParameters
 from skindb.render.image import auto_exposure, tone_map, write_exr, write_png
-from skindb.render.monte_carlo import Lighting, Quality, Rendering, render_monte_carlo
+from skindb.render.monte_carlo import Quality, Rendering, render_monte_carlo
 from skindb.render.plan import KEPT, ScenePlan, plan_scene
 from skindb.render.scene import (
     Camera,
     Environment,
+    Lighting,
     Lights,
     Surface,
     cameras_from_dome,
     from_model,
     lights_from_dome,
-    subdivide_surface,
 )
 from skindb.render.shading import (
     TERMS,
@@ -39,6 +39,7 @@ from skindb.render.shading import (
     transmitted_irradiance,
     tree_opening,
 )
+from skindb.render.subsurface import refined_surface
 from skindb.schema.consent import honour_consent
 from skindb.types import Float32, Progress, dots, lengths
 
@@ -177,7 +178,6 @@ def render(
     subsurface: bool = False,
     terms: Sequence[str] = ("diffuse", "surface"),
     scale: float = 1.0,
-    spacing: float | None = None,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> xr.Dataset:
@@ -208,10 +208,6 @@ def render(
         Terms of the BRDF to include: "diffuse", "surface" or both.
     scale
         Size of the picture relative to that of the camera.
-    spacing
-        Longest edge [mm] of the triangles on which subsurface light is interpolated;
-        default the mesh of the surfels. A third of the diffusion length makes the edges
-        of shadows smooth in a close-up.
     seed
         Random seed.
     progress
@@ -240,7 +236,6 @@ def render(
         camera,
         subsurface=subsurface,
         scale=scale,
-        spacing=spacing,
         error=error,
     )
     quality = Quality(samples, error, subsurface, tuple(terms), tree_opening(error)[0])
@@ -286,7 +281,6 @@ def render_inputs(
     *,
     subsurface: bool,
     scale: float,
-    spacing: float | None = None,
     error: float | None = None,
 ) -> RenderInputs:
     """Surface, camera and lights of a picture, without the parts that it does not need
@@ -304,9 +298,8 @@ def render_inputs(
         require_translucency(surface)
     sized = seen_by.scaled(scale)
     scene = RayScene(surface.vertices, surface.faces)
-    if subsurface and spacing is not None:
-        visible = trace_view(surface, sized, scene=scene).shown(len(surface.vertices))
-        surface = subdivide_surface(surface, spacing, visible)
+    if subsurface:
+        surface = refined_surface(surface, sized, lighting, scene)
         scene = RayScene(surface.vertices, surface.faces)
     plan = plan_scene(
         surface, sized, lighting, scene, subsurface=subsurface, error=error

@@ -240,13 +240,12 @@ def usable_surfels(values: dict[str, AnyArray]) -> Mask:
     return good
 
 
-def subdivide_surface(surface: Surface, spacing: float, visible: Mask) -> Surface:
-    """Subdivide the visible triangles of a surface until their edges have at most a given length.
+def subdivide_surface(surface: Surface, spacing: float, values: Array) -> Surface:
+    """Subdivide triangles until interpolated values differ by at most 1 between their corners,
+    or their edges have at most a given length, or there are `MAX_VERTICES`.
 
-    Irradiance is known at vertices, so the mesh limits the sharpness of shadow edges,
-    and the dipole would blur a jagged edge. Positions and reflectances of new vertices
-    are means of those at both ends of their edge, so that pictures without subsurface
-    light stay the same.
+    Positions and reflectances of new vertices are means of those at both ends of their
+    edge, so that pictures without subsurface light stay the same.
 
     Parameters
     ----------
@@ -254,46 +253,31 @@ def subdivide_surface(surface: Surface, spacing: float, visible: Mask) -> Surfac
         Surface.
     spacing
         Maximum length of edges [mm].
-    visible
-        (v,) visible vertices; triangles without a visible vertex are not divided.
-
-    Raises
-    ------
-    InputError
-        If the mesh would have more than two million vertices.
+    values
+        (v, c) values of the vertices; triangles with NaN are not divided.
     """
     names = [
         name
         for name in ("normals", "diffuse", "parameters", "s", "sigma_tr")
         if getattr(surface, name) is not None
     ]
-    values = {name: float64(getattr(surface, name)) for name in names}
-    values["shown"] = visible.astype(np.float64)[:, None]
+    attributes = {name: float64(getattr(surface, name)) for name in names}
+    attributes["values"] = float64(values)
     vertices = float64(surface.vertices)
     faces = np.asarray(surface.faces, np.int64)
     for _ in range(MAX_LEVELS):
         corners = vertices[faces]
         longest = lengths(corners - np.roll(corners, 1, axis=1)).max(axis=1)
-        chosen = np.flatnonzero(
-            (values["shown"][faces, 0] > 0).any(axis=1) & (longest > spacing)
-        )
-        if not len(chosen):
+        apart = np.ptp(attributes["values"][faces], axis=1).max(axis=1)
+        chosen = np.flatnonzero((apart > 1) & (longest > spacing))
+        if not len(chosen) or len(vertices) + 3 * len(chosen) > MAX_VERTICES:
             break
-        require(
-            len(vertices) + 3 * len(chosen) <= MAX_VERTICES,
-            "spacing",
-            "the part of the face in the picture must have at most "
-            f"{MAX_VERTICES:,} vertices",
-            f"{len(vertices):,} and {len(chosen):,} triangles that are still "
-            f"coarser than {spacing:g} mm",
-            "choose a larger spacing, or a closer picture",
+        vertices, faces, attributes = trimesh.remesh.subdivide(
+            vertices, faces, chosen, vertex_attributes=attributes
         )
-        vertices, faces, values = trimesh.remesh.subdivide(
-            vertices, faces, chosen, vertex_attributes=values
-        )
-    values.pop("shown")
-    values["normals"] = unit(values["normals"])
-    arrays: dict[str, Any] = values
+    attributes.pop("values")
+    attributes["normals"] = unit(attributes["normals"])
+    arrays: dict[str, Any] = attributes
     return replace(surface, vertices=vertices, faces=faces, **arrays)
 
 
@@ -416,6 +400,14 @@ class Environment:
         order = np.argsort(-brightness, kind="stable")
         rising = np.cumsum(self._probability[order])
         return order, rising / rising[-1]
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Lights of a dome, an environment, or both."""
+
+    lights: Lights | None = None
+    environment: Environment | None = None
 
 
 def _inverted(rising: Array, level: Array) -> tuple[Index, Array]:

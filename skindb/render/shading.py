@@ -15,8 +15,19 @@ from skindb.geometry.rays import RayScene
 from skindb.optics.dipole_tree import subsurface_exitance
 from skindb.optics.fresnel import circular_reversal, fresnel_transmittance
 from skindb.reflectance.model import Lamp, Points
+from skindb.reflectance.sampling import tangents
 from skindb.render.scene import Camera, Lights, Surface
-from skindb.types import Array, Float32, Index, Mask, dots, finite_rows, lengths, unit
+from skindb.types import (
+    Array,
+    Float32,
+    Index,
+    Mask,
+    dots,
+    finite_rows,
+    float64,
+    lengths,
+    unit,
+)
 
 DEFAULT_OPENING = 0.1  # of the octree
 # range of openings: below it, the tree takes longer than it saves; above it, pictures
@@ -432,6 +443,17 @@ def _lamp_points(lights: Lights, i: int, total: int) -> Array:
         + np.sin(q * GOLDEN_ANGLE)[:, None] * second
     )
     return lights.position[i] + radius[:, None] * across
+
+
+def points_on_discs(lights: Lights, chosen: Index, rng: np.random.Generator) -> Array:
+    """Points (n, 3) drawn uniformly on the discs of the chosen lights (n,)."""
+    tangent, second = tangents(float64(lights.axis))
+    radius = lights.disc_radius[chosen] * np.sqrt(rng.random(len(chosen)))
+    turn = 2 * np.pi * rng.random(len(chosen))
+    across = (
+        np.cos(turn)[:, None] * tangent[chosen] + np.sin(turn)[:, None] * second[chosen]
+    )
+    return lights.position[chosen] + radius[:, None] * across
 
 
 def _lit(scene: RayScene, view: View, lamp: Array) -> Float32:

@@ -18,9 +18,8 @@ from skindb.optics.diffusion import S_FLOOR
 from skindb.optics.fresnel import boundary_factor
 from skindb.reflectance.model import MAX_TABLES
 from skindb.render.image import image_url, tone_map
-from skindb.render.monte_carlo import Lighting
 from skindb.render.rendering import chosen_camera, chosen_lights, fixed_exposure, render
-from skindb.render.scene import LUMINANCE, Environment, Surface, from_model
+from skindb.render.scene import LUMINANCE, Environment, Lighting, Surface, from_model
 from skindb.render.surfels import surfel_confidence, with_matt_surfels
 from skindb.schema import variables
 from skindb.schema.consent import honour_consent

@@ -21,11 +21,10 @@ from skindb.render.photographs import Comparison, compare_photographs
 from skindb.render.rendering import (
     chosen_camera,
     fixed_exposure,
-    render_inputs,
+    render,
     render_picture,
-    sum_over_lights,
 )
-from skindb.render.scene import Camera, Environment, Lights, lights_from_dome
+from skindb.render.scene import Camera, Environment, Lighting, Lights, lights_from_dome
 from skindb.schema import variables
 from skindb.store import STUDY, Database, intact_or_none, require_fresh
 from skindb.types import Progress, float64, silent
@@ -52,8 +51,6 @@ CLOSE_MM = 40.0  # side of a close-up
 LIGHT_DEGREES = 42.0
 LIGHT_RISE = 0.4
 LIGHT_MM = 800.0  # from the nose
-# of the diffusion length, between the points that receive light in a close-up
-SPACING = 1 / 3
 LANDMARK = "nose_tip"
 COMPONENTS = "components"  # study of modes
 MODE_END = 2.0  # standard deviations at the ends of its slider
@@ -211,7 +208,7 @@ def translucency_grid(
     out: Path,
     *,
     site: str = "cheek",
-    samples: int = 2,
+    samples: int = 8,
     progress: Progress = silent,
 ) -> dict[str, float]:
     """Draw the takes with the shortest and the longest diffusion length at a site, with
@@ -229,7 +226,7 @@ def translucency_grid(
     site
         Of the probe.
     samples
-        Rays per pixel and axis.
+        Rays per pixel.
     progress
         Called with the stage, the number of finished takes and the total number of takes.
 
@@ -258,28 +255,16 @@ def translucency_grid(
         take = extreme(lengths, key=lengths.__getitem__)
         model = db.read("model", take)
         light = _light(model)
-        inputs = render_inputs(
-            model,
-            light,
-            None,
-            _close_up(model),
-            subsurface=True,
-            scale=1.0,
-            spacing=SPACING * lengths[take],
-        )
+        camera = _close_up(model)
         rows[f"{take}\n{lengths[take]:.2f} mm"] = [
-            sum_over_lights(
-                inputs.plan.surface,
-                light,
-                inputs.camera,
-                samples=samples,
-                subsurface=under,
-            )
+            render(
+                model, lights=light, camera=camera, samples=samples, subsurface=under
+            )["radiance"].values
             for under in (True, False)
         ]
         chosen[take] = lengths[take]
     progress("render", 2, 2)
-    gain = fixed_exposure(inputs.given, inputs.camera)
+    gain = fixed_exposure(Lighting(light), camera)
     write_grid(out, rows, ["light under the skin", "without"], exposure=gain)
     return chosen
 

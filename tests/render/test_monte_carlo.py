@@ -21,12 +21,11 @@ from skindb.render.monte_carlo import (
     LIGHTS_PER_RAY,
     MIN_BATCHES,
     LightChoice,
-    Lighting,
     Quality,
     render_monte_carlo,
     stratified,
 )
-from skindb.render.scene import Camera, Environment, Lights, Surface
+from skindb.render.scene import Camera, Environment, Lighting, Lights, Surface
 from skindb.render.shading import exitance_from_irradiance, trace_view, tree_opening
 from tests.pictures import render_view
 

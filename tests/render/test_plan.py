@@ -9,9 +9,9 @@ import pytest
 
 from skindb.geometry.rays import RayScene
 from skindb.optics.diffusion import dipole_s
-from skindb.render.monte_carlo import Lighting, Quality, render_monte_carlo
+from skindb.render.monte_carlo import Quality, render_monte_carlo
 from skindb.render.plan import covered_pixels, plan_scene
-from skindb.render.scene import Camera, Lights, Surface, from_model
+from skindb.render.scene import Camera, Lighting, Lights, Surface, from_model
 from skindb.render.shading import trace_view
 from tests.render.test_monte_carlo import ball, camera
 from tests.small_face import small_face

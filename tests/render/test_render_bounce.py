@@ -17,11 +17,12 @@ from skindb.fit.corrections import bounced_light, without_bounce
 from skindb.geometry.rays import RayScene
 from skindb.optics.diffusion import dipole_s
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.render.monte_carlo import Lighting, Quality, render_monte_carlo
+from skindb.render.monte_carlo import Quality, render_monte_carlo
 from skindb.render.photographs import compare_photographs
 from skindb.render.rendering import sum_over_lights
 from skindb.render.scene import (
     Camera,
+    Lighting,
     Lights,
     Surface,
     cameras_from_dome,
