@@ -96,7 +96,7 @@ def write_report(path: Path, results: Results, *, progress: Progress) -> Path:
         "photographs": sum(map(len, results.compared.values())),
         "held_out": {
             name: [error[name] for error in held_out]
-            for name in ("relative_rmse", "delta_e_median")
+            for name in ("relative_rmse", "relative_median", "delta_e_median")
         },
         "sites": [
             (take, site, *(100 * errors))
@@ -213,7 +213,8 @@ def cell(value: Any) -> str:
         return str(value)
     if np.isnan(value):
         return "-"
-    return f"{value:.3g}" if -1000 < value < 1000 else f"{value:,.0f}"
+    text = f"{value:.3g}" if -1000 < value < 1000 else f"{value:,.0f}"
+    return "0" if text == "-0" else text
 
 
 def _spaced(name: str) -> str:

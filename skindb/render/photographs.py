@@ -71,7 +71,8 @@ def compare_images(
     Returns
     -------
     dict
-        `rmse` (radiance), `relative_rmse` (over the RMS of the photograph), `psnr` [dB,
+        `rmse` (radiance), `relative_rmse` (over the RMS of the photograph),
+        `relative_median` (of the differences over the radiance of each pixel), `psnr` [dB,
         peak 1] and `ssim` of the sRGB images, `delta_e_mean`, `delta_e_median`,
         `delta_e_95` (CIEDE2000, D65), `exposure`, `pixels`. SSIM is the mean over
         windows that lie entirely inside the mask, or NaN if there are none. Values
@@ -82,12 +83,15 @@ def compare_images(
     gain = auto_exposure(theirs, mask=inside) if exposure is None else exposure
     error = np.sqrt(np.mean((ours - theirs)[inside] ** 2))
     level = np.sqrt(np.mean(theirs[inside] ** 2))
+    shown = inside & (theirs.sum(axis=2) > 0)
+    of_pixels = np.abs(ours - theirs)[shown].sum(axis=1) / theirs[shown].sum(axis=1)
     encoded = [encode_srgb(image * gain) for image in (ours, theirs)]
     noise = np.mean((encoded[0] - encoded[1])[inside] ** 2)
     delta = delta_e(ours[inside] * gain, theirs[inside] * gain)
     return {
         "rmse": float(error),
         "relative_rmse": float(error / level) if level > 0 else float("nan"),
+        "relative_median": float(np.median(of_pixels)) if shown.any() else float("nan"),
         "psnr": float(-10 * np.log10(noise)) if noise > 0 else float("inf"),
         "ssim": _ssim(encoded[0], encoded[1], inside),
         "delta_e_mean": float(delta.mean()),

@@ -54,6 +54,15 @@ def test_write_report__one_row_for_each_take(report):
     assert text.count("<summary>Pictures and maps of") == len(TAKES)
 
 
+def test_write_report__begins_with_medians_over_the_takes(report):
+    first = report.read_text().split("<section>")[0]
+    found = [float(value) for value in re.findall(r"<dd>([\d.e-]+)</dd>", first)]
+    planted = [NORMAL_ERROR, 100 * DIFFUSE_ERROR, 100 * HELD_OUT_ERROR]
+    assert found[:3] == [pytest.approx(value) for value in planted]
+    assert len(found) == 4
+    assert 'src="viewer.html"' in first
+
+
 def test_write_report__states_why_surfels_have_no_fit(report):
     text = report.read_text()
     for status, count in PLANTED.items():
@@ -95,7 +104,7 @@ def test_write_report__without_edits_and_traits(report):
 
 
 def test_cell__is_short_and_readable():
-    values = (175952, np.int64(23), 0.012345, 1234.5, np.nan, "a", True)
+    values = (175952, np.int64(23), 0.012345, 1234.5, np.nan, "a", True, -0.0)
     assert [cell(value) for value in values] == [
         "175,952",
         "23",
@@ -104,6 +113,7 @@ def test_cell__is_short_and_readable():
         "-",
         "a",
         "True",
+        "0",
     ]
 
 
@@ -140,6 +150,7 @@ def test_write_report__fits_a_narrow_page(report, browser, theme):
     assert page.evaluate(unnamed) == 0
     files = [
         report.as_uri(),
+        report.with_name("viewer.html").as_uri(),
         *(image.as_uri() for image in report.parent.glob("plots/*.png")),
     ]
     assert {url for url in asked if not url.startswith("data:")} == set(files)

@@ -28,6 +28,7 @@ def test_compare_images__equal_images_have_no_error(photograph: np.ndarray) -> N
 def test_compare_images__known_scale(photograph: np.ndarray) -> None:
     found = compare_images(photograph * 1.1, photograph)
     assert found["relative_rmse"] == pytest.approx(0.1)
+    assert found["relative_median"] == pytest.approx(0.1)
     assert found["rmse"] == pytest.approx(0.1 * np.sqrt((photograph**2).mean()))
 
 
