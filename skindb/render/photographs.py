@@ -322,7 +322,9 @@ def _shaded(
 
 def _photograph_variance(photo: Image, capture: xr.DataTree, camera: int) -> Image:
     """Variance (h, w) of the mean channel [radiance^2]; 0 where the noise is not known."""
-    noise = capture["samples"].to_dataset()
+    noise = xr.Dataset()
+    if "samples" in capture.children:
+        noise = capture["samples"].to_dataset()
     names = (
         variables.RADIANCE_LIMIT,
         variables.RADIANCE_READ_VARIANCE,
