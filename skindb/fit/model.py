@@ -46,7 +46,7 @@ from skindb.threads import on_one_blas_thread
 from skindb.types import Float64, Progress, silent
 
 COMPILING = "compiling, only after an installation"
-COPIED_GROUPS = ("mesh", "dome", "probe")
+COPIED_GROUPS = ("mesh", "dome", "probe", "detail")
 # of the first pass, that the second one uses
 ESTIMATES = (
     "shading_normal",

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from concurrent.futures import Executor, Future, wait
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -35,6 +35,7 @@ from skindb.ingest._sample_kernels import (
     view_levels,
 )
 from skindb.ingest.consistency import Calibration, CalibrationCheck, Pair
+from skindb.ingest.detail import CameraSampling, Detail
 from skindb.ingest.faults import (
     MAX_SAMPLE,
     MIN_MEDIAN_SAMPLES,
@@ -68,13 +69,6 @@ MAX_SMEAR_MM = 12.0
 LINEAR_NOISE_FLOOR = 1e-4  # sr^-1; for linear files, whose noise is unknown
 
 
-class CameraSampling(NamedTuple):
-    """Where and how one camera samples the surfels, the same under every light."""
-
-    surfels: Mask  # (n,) those that it samples
-    pixels: Float32  # (n, 2)
-
-
 @dataclass(frozen=True)
 class ViewLevels:
     """Levels of each view (light, camera); NaN, or nothing to report, for views of an
@@ -100,6 +94,7 @@ class Lumitexels:
     photographs: Mapping[tuple[int, int], Image]
     calibration: Calibration | None = None  # None: not checked
     noise: SampleNoise | None = None  # None: the electrons of a camera are unknown
+    detail: Detail | None = None  # None: the photographs are not finer than the surfels
 
 
 def fully_lit(
@@ -165,6 +160,7 @@ class Sampler:
         self._sampled = self.spool.done.copy()  # or found to be faulty
         self._patterns = SensorPatterns(self.check.dome, self.mergers)
         surfels = self.check.surfels
+        self._detail = Detail.of(surfels, self.check.dome.cameras)
         frontal = self.pool.map(
             lambda camera: _frontal(camera, surfels), self.check.dome.cameras
         )
@@ -238,8 +234,14 @@ class Sampler:
         call = partial(attempt, self.faults)
         sample = partial(self._sample_view, picture=pictures)
         ended = _in_turn(self.pool, lambda pair: call(partial(sample, *pair)), missing)
-        for pair, _ in zip(missing, ended, strict=True):
+        for pair, texels in zip(missing, ended, strict=True):
             self._sampled[pair] = True
+            # in order, as sums depend on it
+            if texels is not None and self._detail is not None:
+                j, c = pair
+                dome = self.check.dome
+                places = dome.lights[j].position, dome.cameras[c].centre
+                self._detail.add(*texels, j, *places)
             self.progress("sample", int(self._sampled.sum()), self._sampled.size)
 
     def _lumitexels(self, calibration: Calibration | None) -> Lumitexels:
@@ -258,9 +260,15 @@ class Sampler:
             photographs=self._kept(self.kept, _photograph_name),
             calibration=calibration,
             noise=sample_noise(check.dome, check.pixels, pixels.T),
+            detail=self._detail,
         )
 
-    def _sample_view(self, j: int, c: int, *, picture: bool) -> None:
+    def _sample_view(
+        self, j: int, c: int, *, picture: bool
+    ) -> tuple[Values16, Bytes] | None:
+        """Sample a view for the spool; the samples and outcomes of the points of the detail,
+        unless the photograph is kept to judge them.
+        """
         dome = self.check.dome
         light = dome.lights[j]
         merger = self.mergers[dome.cameras[c].id]
@@ -271,11 +279,15 @@ class Sampler:
         self._patterns.add(j, c, frames)
         require_none(view_faults(dome, light.id, merger, frames))
         surfels = shot.surfels & self.lit[:, j]
+        fine = None
+        if self._detail is not None and (j, c) not in self.kept:
+            fine = self._detail.shot(surfels, c)
         whole = picture or (j, c) in self.kept
         height, width, _ = frames[0].shape
         spans = None
         if not whole:
-            spans = pixel_spans(surfels, shot.pixels, height, width)
+            shown = shot._replace(surfels=surfels) if fine is None else fine
+            spans = pixel_spans(*shown, height, width)
         radiance, flag = merger.merge(frames, spans)
         merged = MergedView(radiance, flag)
         if whole:
@@ -285,7 +297,9 @@ class Sampler:
             self.spool.pictures[name] = self.check.reduce(c, radiance)
         if (j, c) in self.kept:
             self.spool.pictures[_photograph_name((j, c))] = radiance
-        samples, outcome = self._gathered(merged, shot, surfels, j)
+        samples, outcome = self._gathered(
+            merged, shot._replace(surfels=surfels), self.check.surfels, j
+        )
         count, lit, median, bright = view_levels(samples, outcome, MAX_SAMPLE)
         levels = self._levels
         if count >= MIN_MEDIAN_SAMPLES:
@@ -301,21 +315,28 @@ class Sampler:
             levels.bright[j, c] = bright
         levels.highest[j, c], levels.clipped[j, c] = highest_value(merger, frames)
         self.spool.put(j, c, samples, outcome, digests)
+        if fine is None or self._detail is None:
+            return None
+        return self._gathered(merged, fine, self._detail, j)
 
     def _gathered(
-        self, merged: MergedView, shot: CameraSampling, surfels: Mask, j: int
+        self,
+        merged: MergedView,
+        shot: CameraSampling,
+        points: SurfelSet | Detail,
+        j: int,
     ) -> tuple[Values16, Bytes]:
-        """Bits of the samples (3, n) of a view, and outcome (n,) for each surfel."""
+        """Bits of the samples (3, n) of a view, and outcome (n,) for each point."""
         check = self.check
         light = check.dome.lights[j]
-        out = np.empty((3, len(surfels)), np.uint16)
-        outcome = np.empty(len(surfels), np.uint8)
+        out = np.empty((3, len(shot.pixels)), np.uint16)
+        outcome = np.empty(len(shot.pixels), np.uint8)
         gather(
             merged,
-            surfels,
+            shot.surfels,
             shot.pixels,
-            check.surfels.position,
-            check.surfels.normal,
+            points.position,
+            points.normal,
             PointLight(
                 light.position, light.axis, float(light.falloff), check.intensity[j]
             ),

@@ -169,7 +169,7 @@ def fine_contrast(
     rendered, photographed
         (h, w, 3) radiance.
     mask
-        (h, w) pixels to compare; those near its edge and in shadows are left out.
+        (h, w) pixels to compare; those near its edge and in shadows are excluded.
     variance
         (h, w) [radiance^2] of the noise of the photograph's mean channel.
     sigma

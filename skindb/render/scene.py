@@ -65,6 +65,10 @@ class Surface:
     eta: float = 1.3
     # whether light that other parts reflect with one diffuse bounce is added
     inter_reflection: bool = False
+    uv: Array | None = None  # (v, 2) texture coordinates, for the detail
+    # (size, size, 6) relative difference of R_d, and difference of the unit normal, of the
+    # texels from the interpolated vertices
+    detail: Array | None = None
 
     @cached_property
     def transfer(self) -> csr_array:
@@ -204,6 +208,11 @@ def from_model(model: xr.DataTree) -> Surface:
     nearest = np.flatnonzero(usable)[near]
     values = {name: value[nearest] for name, value in values.items()}
     sigma_tr = values.get(variables.SIGMA_TR)
+    detail = None
+    if "detail" in model.children:
+        maps = model["detail"].dataset
+        names = (variables.DIFFUSE_DETAIL, variables.NORMAL_DETAIL)
+        detail = np.concatenate([maps[name].values for name in names], axis=2)
     return Surface(
         vertices=position.astype(np.float64),
         faces=model["mesh"].dataset[variables.TRIANGLE].values,
@@ -217,6 +226,8 @@ def from_model(model: xr.DataTree) -> Surface:
         else None,
         eta=float(fitted[variables.REFRACTIVE_INDEX]),
         inter_reflection=bool(fitted.get(variables.INTER_REFLECTION, False)),
+        uv=None if detail is None else fitted[variables.SURFEL_UV].values,
+        detail=detail,
     )
 
 
@@ -258,7 +269,7 @@ def subdivide_surface(surface: Surface, spacing: float, values: Array) -> Surfac
     """
     names = [
         name
-        for name in ("normals", "diffuse", "parameters", "s", "sigma_tr")
+        for name in ("normals", "diffuse", "parameters", "s", "sigma_tr", "uv")
         if getattr(surface, name) is not None
     ]
     attributes = {name: float64(getattr(surface, name)) for name in names}

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from skindb.errors import input_error
+from skindb.geometry.atlas import bilinear
 from skindb.geometry.mesh import face_crosses, vertex_areas
 from skindb.geometry.rays import RayScene
 from skindb.optics.dipole_tree import subsurface_exitance
@@ -218,6 +219,7 @@ class View:
     position: Array  # (n, 3) mm
     normal: Array  # (n, 3) unit
     towards: Array  # (n, 3) unit, to the camera
+    tint: Array  # (n, 3) or (1, 1) factor of the detail on what is diffuse
 
     @property
     def coverage(self) -> Image:
@@ -300,7 +302,9 @@ def trace_view(
     hit = np.flatnonzero(face >= 0)
     corners = np.asarray(surface.faces)[face[hit]].astype(np.int64)
     weight = barycentric[hit]
-    position, normal, towards, facing = _facing_points(surface, camera, corners, weight)
+    position, normal, towards, tint, facing = _facing_points(
+        surface, camera, corners, weight
+    )
     pixel, ray = np.divmod(hit[facing], samples**2)
     return View(
         camera,
@@ -312,24 +316,31 @@ def trace_view(
         position[facing],
         normal[facing],
         towards[facing],
+        tint if surface.detail is None else tint[facing],
     )
 
 
 def _facing_points(
     surface: Surface, camera: Camera, corners: Index, weight: Array
-) -> tuple[Array, Array, Array, Mask]:
-    """Positions, unit normals and directions to the camera (n, 3) of hits, and whether
-    the surface and its shading normal face the camera.
+) -> tuple[Array, Array, Array, Array, Mask]:
+    """Positions, unit normals, directions to the camera and `View.tint` (n, 3) of hits, and
+    whether the surface and its shading normal face the camera.
     """
+    tint = np.ones((1, 1))
     normal = np.einsum("nk,nkc->nc", weight, surface.normals[corners])
     position = np.einsum("nk,nkc->nc", weight, surface.vertices[corners])
+    if surface.detail is not None and surface.uv is not None:
+        uv = np.einsum("nk,nkc->nc", weight, surface.uv[corners])
+        detail = bilinear(surface.detail, uv * len(surface.detail))
+        tint = 1 + detail[:, :3]
+        normal += detail[:, 3:]
     with np.errstate(invalid="ignore"):
         normal = unit(normal)
         towards = camera.centre - position
         towards = unit(towards)
         facet = face_crosses(surface.vertices, corners)
         facing = (dots(normal, towards) > 0) & (dots(facet, towards) > 0)
-    return position, normal, towards, facing
+    return position, normal, towards, tint, facing
 
 
 def shade_view(
@@ -413,6 +424,7 @@ def seen_points(
     parameters: Array = np.zeros((len(view.pixel), 0))
     if with_surface:
         parameters = view.interpolate(surface.parameters)
+    diffuse = diffuse * view.tint
     return Points(view.position, view.normal, view.towards, diffuse, parameters)
 
 
@@ -469,8 +481,8 @@ def _lit(scene: RayScene, view: View, lamp: Array) -> Float32:
 
 
 def escape_factor(view: View, eta: float) -> Array:
-    """(n, 1) F_t(w_o) / pi: radiance towards the camera per radiant exitance under the
-    boundary (eq. 9).
+    """(n, 1) or (n, 3) F_t(w_o) / pi: radiance towards the camera per radiant exitance under
+    the boundary (eq. 9), with the detail.
     """
     cosine = dots(view.normal, view.towards)
-    return (fresnel_transmittance(cosine, eta) / np.pi)[:, None]
+    return view.tint * (fresnel_transmittance(cosine, eta) / np.pi)[:, None]

@@ -131,6 +131,26 @@ ATLAS_FLIPS = declare(
     "triangles that are turned over in the map, counted exactly: 0",
 )
 
+# detail
+DIFFUSE_DETAIL = declare(
+    "float16 detail/diffuse_detail(v, u, channel) [1]",
+    "R_d of a texel of the atlas over that interpolated between the surfels, minus 1; 0 "
+    "where it is not known; only where the photographs are finer than the surfels",
+)
+DIFFUSE_DETAIL_ERROR = declare(
+    "float16 detail/diffuse_detail_error(v, u, channel) [1]",
+    "standard error of diffuse_detail; NaN where it is not known",
+)
+NORMAL_DETAIL = declare(
+    "float16 detail/normal_detail(v, u, xyz) [1]",
+    "unit normal of a texel minus that interpolated between the surfels; 0 where it is not "
+    "known",
+)
+NORMAL_DETAIL_ERROR = declare(
+    "float16 detail/normal_detail_error(v, u, xyz) [1]",
+    "standard error of normal_detail; NaN where it is not known",
+)
+
 # dome
 LIGHT_POSITION = declare(
     "float32 dome/light_position(light, xyz) [mm]",

@@ -302,3 +302,28 @@ def test_render_view__subsurface_light_crosses_a_shadow_line() -> None:
 def test_render_view__subsurface_needs_its_parameters() -> None:
     with pytest.raises(ValueError, match="must have s and sigma_tr"):
         render_view(plane(), camera(), lights((0, 0, 400)), subsurface=True)
+
+
+def test_trace_view__detail_of_texels() -> None:
+    """Rationale: one tilt and one factor in the left half of the map are those of a surface
+    with these normals and this R_d. Expected: the same picture there, and no change to the right.
+    """
+    flat = plane()
+    x, y, _ = flat.vertices.T
+    tilt = np.array([0.2, -0.1, 0.05])
+    detail = np.zeros((64, 64, 6), np.float16)
+    detail[:, :32] = [0.25, -0.5, 0.5, *tilt]
+    uv = np.stack([x / 200 + 0.5, 0.5 - y / 200], axis=1)
+    # exactly representable factors; the tilt is rounded as the map is
+    tilted = replace(
+        flat,
+        normals=flat.normals + tilt.astype(np.float16),
+        diffuse=flat.diffuse * [1.25, 0.5, 1.5],
+    )
+    shown, half, whole = (
+        render_view(surface, camera(), lights((200, 100, 400)))
+        for surface in (replace(flat, uv=uv, detail=detail), tilted, flat)
+    )
+    # columns beside the middle mix both halves
+    assert shown[..., :11, :3] == pytest.approx(half[..., :11, :3], rel=1e-5)
+    assert shown[..., 13:, :3] == pytest.approx(whole[..., 13:, :3], rel=1e-5)
