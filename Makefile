@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+EXECUTED := docs/_build/notebooks
 
 .PHONY: demo test test-all suite pages readme commands notebooks lint types docs clean
 
@@ -35,6 +36,7 @@ commands: $(STAMP)
 
 notebooks: $(STAMP)
 	$(BIN)/python .ci/run_notebooks.py
+	touch $(EXECUTED)
 	$(MAKE) docs
 
 lint: $(STAMP)
@@ -45,10 +47,15 @@ lint: $(STAMP)
 types: $(STAMP)
 	$(BIN)/mypy
 
-docs: $(STAMP)
+# the notebooks are executed if they have changed and `make demo` has written their database
+docs: $(STAMP) $(if $(wildcard demo/db),$(EXECUTED))
 	$(BIN)/python docs/make_variables.py
 	rm -rf docs/api/generated
 	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet docs docs/_build/html
+
+$(EXECUTED): $(wildcard notebooks/*.ipynb) | $(STAMP)
+	$(BIN)/python .ci/run_notebooks.py
+	touch $@
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if v >= (3, 11) else f"skindb needs Python 3.11 or later; {sys.executable} is {v[0]}.{v[1]}; call: make PYTHON=/path/to/python3.11")'

@@ -55,6 +55,7 @@ html_theme = "pydata_sphinx_theme"
 html_title = f"skindb {release}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_favicon = "_static/logo.svg"
 # no subpages
 html_sidebars = {
     page: [] for page in ("index", "getting_started", "tutorial", "contributing")
@@ -62,7 +63,11 @@ html_sidebars = {
 html_show_sourcelink = False
 html_copy_source = False
 html_theme_options = {
-    "logo": {"text": "skindb"},
+    "logo": {
+        "text": "skindb",
+        "image_light": "_static/logo.svg",
+        "image_dark": "_static/logo.svg",
+    },
     "navigation_with_keys": False,
     "show_prev_next": True,
     "show_nav_level": 1,
@@ -127,8 +132,17 @@ def _block(page: HTML5Translator, node: nodes.math_block) -> None:
     raise nodes.SkipNode
 
 
+def _copy_viewer(app: Sphinx) -> None:
+    """Copy the viewer of `make demo`, if there is one, which the first page then shows."""
+    viewer = ROOT / "demo" / "viewer.html"
+    if viewer.is_file():
+        Path(app.outdir).mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(viewer, Path(app.outdir) / viewer.name)
+        app.tags.add("viewer")
+
+
 def _prepare(app: Sphinx) -> None:
-    del app
+    _copy_viewer(app)
     _copy_notebooks()
     _write_commands()
 
