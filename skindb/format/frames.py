@@ -25,6 +25,7 @@ import Imath
 import numpy as np
 import OpenEXR
 import tifffile
+from tifffile import PHOTOMETRIC
 
 from skindb.elementwise import thread_count
 from skindb.errors import Fault, InputError, attempt, input_error, require, require_none
@@ -303,10 +304,16 @@ def _tiff_header(stream: BinaryIO) -> Header:
             # damaged tags are tuples or text
             height, width, *channels = (operator.index(side) for side in page.shape)
             if page.dtype is not None:
-                return width, height, math.prod(channels), np.dtype(page.dtype)
+                count = 3 if _has_filters(page) else math.prod(channels)
+                return width, height, count, np.dtype(page.dtype)
     except TIFF_DAMAGE:
         pass
     raise UnreadableError(DAMAGED)
+
+
+def _has_filters(page: Any) -> bool:
+    """Whether the pixels are those of a sensor with a colour filter array (TIFF/EP)."""
+    return bool(page.photometric == PHOTOMETRIC.CFA and page.ndim == 2)
 
 
 @dataclass(frozen=True)
@@ -458,11 +465,43 @@ def _decode_any_png(content: bytes) -> Frame:
         raise UnreadableError(DAMAGED) from None
 
 
-def _decode_tiff(_: Path, content: bytes) -> Frame:
+def _decode_tiff(path: Path, content: bytes) -> Frame:
     try:
-        return np.asarray(tifffile.imread(io.BytesIO(content), key=0))
+        with tifffile.TiffFile(io.BytesIO(content)) as file:
+            page: Any = file.pages[0]
+            values = np.asarray(page.asarray())
+            if not _has_filters(page):
+                return values
+            pattern = "".join("RGB"[i] for i in page.tags["CFAPattern"].value)
+            full = np.iinfo(values.dtype).max
+            top = operator.index(page.tags.valueof("MaxSampleValue", full))
     except TIFF_DAMAGE:
         raise UnreadableError(DAMAGED) from None
+    return _demosaiced(path, values, pattern, top)
+
+
+def _demosaiced(path: Path, values: AnyArray, pattern: str, top: int) -> Frame:
+    """Bilinear interpolation (h, w, 3) of sensor values (h, w) behind colour filters.
+
+    Pixels beside one that has the value `top` are saturated, too, as their mean would be
+    too small.
+    """
+    try:
+        import cv2
+    except ImportError:
+        raise input_error(
+            str(path),
+            "frames of a colour filter array are interpolated by OpenCV",
+            "no OpenCV",
+            "pip install 'skindb[cameras]'",
+        ) from None
+    try:
+        frame = cv2.demosaicing(values, getattr(cv2, f"COLOR_Bayer{pattern}2RGB"))
+        near = cv2.dilate(np.asarray(values >= top, np.uint8), np.ones((3, 3)))
+        frame[near > 0] = top
+    except (AttributeError, OverflowError, cv2.error):
+        raise UnreadableError(DAMAGED) from None  # of no such filters or values
+    return np.asarray(frame)
 
 
 def _decode_exr(path: Path, content: bytes) -> Frame:

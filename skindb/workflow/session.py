@@ -3,7 +3,7 @@
 import re
 import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +16,7 @@ from skindb.format.fields import IDENTIFIER, read_json
 from skindb.format.folder import read_capture, record_faults
 from skindb.geometry.scan import read_scan
 from skindb.hw import conformance
-from skindb.hw.cameras import FolderCameras
+from skindb.hw.cameras import Cameras, FolderCameras
 from skindb.hw.capture import CapturePlan, Devices, planned_schedule, run_capture
 from skindb.hw.capture_folder import (
     Setup,
@@ -30,6 +30,7 @@ from skindb.hw.frame_markers import marker_light, with_markers
 from skindb.hw.link import Link, close_port, open_port
 from skindb.hw.probe import Probe
 from skindb.hw.sequence import Override, Rehearsal, assess, slower_alternative
+from skindb.hw.streaming import STREAMS, StreamingCameras
 from skindb.parameters import VIRTUAL_SEED, SessionParameters
 from skindb.schema.consent import SCOPES
 from skindb.types import Progress, silent
@@ -408,15 +409,20 @@ def _devices(
             stack.callback(connected.close)
             return connected
 
-        cameras = FolderCameras(watched, setup.dome.camera_ids, clock=clock)
+        def connected(ids: Sequence[str]) -> Cameras:
+            if laboratory is not None or not (watched / STREAMS).is_file():
+                return FolderCameras(watched, ids, clock=clock)
+            cameras = StreamingCameras(watched, ids)
+            stack.callback(cameras.close)
+            return cameras
+
+        cameras = connected(setup.dome.camera_ids)
         dome = Dome(link("dome"))
         if not plan.sites or (laboratory is None and not parameters.probe):
             yield Devices(dome, cameras)
             return
         probe = Probe(link("probe"))
-        yield Devices(
-            dome, cameras, probe, FolderCameras(watched, ["probe"], clock=clock)
-        )
+        yield Devices(dome, cameras, probe, connected(["probe"]))
 
 
 @contextmanager

@@ -3,6 +3,7 @@ from __future__ import annotations
 import contextlib
 import io
 import struct
+import sys
 import tracemalloc
 import zlib
 
@@ -22,6 +23,7 @@ from skindb.format.frames import (
     read_frame,
     write_frame,
 )
+from skindb.hw.aravis import tiff_head
 
 RNG = np.random.default_rng(0)
 FRAMES = {
@@ -204,6 +206,65 @@ def test_header_faults__a_damaged_height_asks_for_no_table_larger_than_the_file(
     write_frame(tmp_path / "a.exr", FRAMES["half.exr"][0])
     with pytest.raises(UnreadableError, match="cut off"):
         _exr_blocks(io.BytesIO((tmp_path / "a.exr").read_bytes()), height)
+
+
+COLOURS = {"RG": "RGGB", "GR": "GRBG", "GB": "GBRG", "BG": "BGGR"}
+
+
+def _raw(path, scene, pattern, bits=12):
+    """A scene (h, w, 3) as a sensor with a colour filter array sees it."""
+    values = np.zeros(scene.shape[:2], np.uint8 if bits == 8 else np.uint16)
+    for i, colour in enumerate(COLOURS[pattern]):
+        part = (slice(i // 2, None, 2), slice(i % 2, None, 2))
+        values[part] = scene[..., "RGB".index(colour)][part]
+    height, width = values.shape
+    head = tiff_head(width, height, f"Bayer{pattern}{bits}")
+    path.write_bytes(head + values.tobytes())
+    return values
+
+
+@pytest.mark.parametrize("bits", [8, 12])
+@pytest.mark.parametrize("pattern", list(COLOURS))
+def test_read_frame__interpolates_a_colour_filter_array(tmp_path, pattern, bits):
+    y, x = np.mgrid[:12, :16]
+    # linear functions are interpolated without an error
+    scene = np.stack([20 + 2 * x + 2 * y, 60 + 4 * x, 90 - 2 * y + 2 * x], axis=2)
+    _raw(tmp_path / "a.tif", scene, pattern, bits)
+    kind = FrameKind(16, 12, bits)
+    assert header_faults(tmp_path / "a.tif", kind, "frames") == []
+    frame = read_frame(tmp_path / "a.tif", kind)
+    np.testing.assert_array_equal(frame[2:-2, 2:-2], scene[2:-2, 2:-2])
+
+
+def test_read_frame__beside_a_saturated_pixel_no_channel_is_too_dark(tmp_path):
+    scene = np.full((9, 9, 3), 1000)
+    scene[4, 4] = 4095
+    values = _raw(tmp_path / "a.tif", scene, "RG")
+    frame = read_frame(tmp_path / "a.tif")
+    assert values[4, 4] == 4095
+    assert (frame[3:6, 3:6] == 4095).all()
+    assert (frame == 4095).sum() == 27
+
+
+def test_read_frame__of_a_colour_filter_array_needs_opencv(tmp_path, monkeypatch):
+    _raw(tmp_path / "a.tif", np.full((8, 8, 3), 9), "RG")
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(InputError, match=r"pip install 'skindb\[cameras\]'"):
+        read_frame(tmp_path / "a.tif")
+
+
+@pytest.mark.slow
+def test_read_frame__no_change_of_a_raw_header_is_an_internal_error(tmp_path):
+    _raw(tmp_path / "a.tif", np.full((6, 8, 3), 9), "RG")
+    content = (tmp_path / "a.tif").read_bytes()
+    for place in range(len(content) - 96):
+        for value in (0, 1, 2, 255):
+            damaged = bytearray(content)
+            damaged[place] = value
+            (tmp_path / "a.tif").write_bytes(damaged)
+            header_faults(tmp_path / "a.tif", FrameKind(8, 6, 12), "frames")
+            with contextlib.suppress(InputError):
+                read_frame(tmp_path / "a.tif")
 
 
 @pytest.mark.slow

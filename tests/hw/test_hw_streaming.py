@@ -1,0 +1,140 @@
+"""Cameras that stream, on the fake GigE Vision camera of Aravis."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+from skindb.errors import InputError, SkindbWarning
+from skindb.format.frames import FrameKind, read_frame
+from skindb.hw.aravis import tiff_head
+from skindb.hw.streaming import PYTHON, STREAMS, StreamingCameras
+
+FAKE = "arv-fake-gv-camera-0.8"
+ADDRESS = "127.0.0.1"
+WIDTH, HEIGHT = 512, 400
+SIZE = f"Width={WIDTH} Height={HEIGHT}"
+TRIGGERED = "TriggerMode=On TriggerSource=Software"
+
+
+def _has_aravis():
+    code = "import gi; gi.require_version('Aravis', '0.8')"
+    try:
+        done = subprocess.run([PYTHON, "-c", code], capture_output=True, check=False)
+    except OSError:
+        return False
+    return done.returncode == 0 and shutil.which(FAKE) is not None
+
+
+pytestmark = pytest.mark.skipif(
+    not _has_aravis(),
+    reason="needs Debian's gir1.2-aravis-0.8, python3-gi and aravis-tools",
+)
+
+
+@pytest.fixture(scope="module", params=[0])
+def camera(request):
+    command = [FAKE, "-i", ADDRESS, "-r", str(request.param)]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+        yield
+        process.terminate()
+
+
+def _streams(tmp_path, features, device=ADDRESS):
+    record = {"cameras": [{"id": "c0", "device": device, "features": features}]}
+    (tmp_path / STREAMS).write_text(json.dumps(record))
+    return StreamingCameras(tmp_path, ["c0"])
+
+
+def _numbers(shots):
+    return [int(re.search(r"_(\d+)\.tif", shot.path.name)[1]) for shot in shots]
+
+
+@pytest.mark.parametrize("pixel_format", ["BayerRG8", "BayerGB8"])
+def test_streaming_cameras__each_trigger_gives_its_frame(
+    camera, tmp_path, pixel_format
+):
+    cameras = _streams(tmp_path, f"PixelFormat={pixel_format} {SIZE} {TRIGGERED}")
+    try:
+        cameras.start()
+        for count in range(1, 6):
+            cameras.trigger()
+            shots = cameras.collect(count)["c0"]
+            assert len(shots) == count
+        cameras.start()  # of the next run
+        cameras.trigger()
+        [last] = cameras.collect(1)["c0"]
+    finally:
+        cameras.close()
+    numbers = _numbers([*shots, last])
+    # this camera counts frame periods, and begins again after 65535
+    assert numbers == sorted(set(numbers))
+    assert not any(shot.is_doubtful for shot in shots)
+    for shot in shots:
+        assert shot.path.stat().st_mode & 0o077 == 0
+        frame = read_frame(shot.path, FrameKind(WIDTH, HEIGHT, 8))
+        assert frame.shape == (HEIGHT, WIDTH, 3)
+
+
+def test_streaming_cameras__a_run_without_triggers_keeps_every_frame(camera, tmp_path):
+    cameras = _streams(tmp_path, f"PixelFormat=Mono8 {SIZE} TriggerMode=Off")
+    try:
+        cameras.start()
+        shots = cameras.collect(30)["c0"]
+    finally:
+        cameras.close()
+    files = sorted((tmp_path / "c0").iterdir())
+    numbers = [int(re.search(r"_(\d+)\.tif", path.name)[1]) for path in files]
+    assert np.diff(numbers).tolist() == [1] * (len(files) - 1)
+    assert len(files) >= len(shots) >= 30
+    head = len(tiff_head(WIDTH, HEIGHT, "Mono8"))
+    assert {path.stat().st_size for path in files} == {head + WIDTH * HEIGHT}
+
+
+@pytest.mark.parametrize(
+    ("features", "device", "said"),
+    [
+        ("Gian=3", ADDRESS, r"camera c0: must stream; found \[Gian\] Not found; cor"),
+        ("PixelFormat=RGB8", ADDRESS, "PixelFormat RGB8 is not Mono or Bayer"),
+        (SIZE, "127.0.0.77", "camera c0: must stream; found .*127.0.0.77"),
+        ("", "", "must be text, and not empty"),
+    ],
+)
+def test_streaming_cameras__a_wrong_setting_is_one_line(
+    camera, tmp_path, features, device, said
+):
+    with pytest.raises(InputError, match=said):
+        _streams(tmp_path, features, device)
+
+
+@pytest.mark.parametrize("camera", [300], indirect=True)  # of 1,000 packets
+def test_streaming_cameras__lost_packets_are_said(camera, tmp_path):
+    cameras = _streams(tmp_path, f"PixelFormat=Mono8 {SIZE} {TRIGGERED}")
+    try:
+        cameras.start()
+        cameras._quiet = 1.0
+        cameras.trigger()
+        with pytest.warns(SkindbWarning, match="camera c0 lost frames"):
+            shots = cameras.collect(1)["c0"]
+    finally:
+        cameras.close()
+    # only complete ones are kept
+    head = len(tiff_head(WIDTH, HEIGHT, "Mono8"))
+    assert all(shot.path.stat().st_size == head + WIDTH * HEIGHT for shot in shots)
+
+
+def test_streaming_cameras__a_camera_that_vanished_is_named(camera, tmp_path):
+    cameras = _streams(tmp_path, f"PixelFormat=Mono8 {SIZE} {TRIGGERED}")
+    cameras.start()
+    cameras._processes["c0"].kill()
+    cameras._quiet = 0.1
+    try:
+        with pytest.raises(InputError, match="camera c0: must stream; found a program"):
+            cameras.collect(1)
+    finally:
+        cameras.close()
