@@ -632,6 +632,16 @@ class RenderParameters(Limited):
     camera: str | None = option(
         None, "Name of a camera of the dome.  [default: the most frontal one]"
     )
+    view: Literal["dome", "front", "three-quarter", "left", "right"] = option(
+        "dome",
+        "View: that of a camera of the dome, or of the whole face; left is the subject's left.",
+    )
+    light_from: str | None = option(
+        None,
+        "Light at an azimuth, from the front to the subject's left, and an elevation in "
+        "degrees.",
+        metavar="AZ,EL",
+    )
     samples: int = option(
         32, "Number of rays per pixel.", name="spp", minimum=8, maximum=4096
     )
@@ -642,12 +652,13 @@ class RenderParameters(Limited):
         maximum=1,
     )
     seed: int = seed_option("the directions of rays")
-    scale: float = option(
-        1.0,
-        "Size of the picture relative to that of the camera.",
-        minimum=0.1,
-        maximum=20,
+    size: int | None = option(
+        None,
+        "Width of the picture in pixels.  [default: that of the camera; 480 with a view]",
+        minimum=8,
+        maximum=8192,
     )
+    alpha: bool = option(False, "Make the background of a PNG transparent.")
     exposure: float | Literal["fixed", "auto"] = option(
         "fixed",
         "Exposure of a PNG: fixed (a white matt surface appears white), auto (for each "

@@ -406,8 +406,8 @@ def test_cli__explain_plans_and_does_not_work(small_database, tmp_path):
         "--light",
         "l000",
         "--subsurface",
-        "--scale",
-        "0.5",
+        "--size",
+        "80",
     )
     planned = _run(*call, "--explain").stdout.strip()
     assert "results stay the same" in planned
@@ -510,7 +510,7 @@ def test_cli__many_takes_at_a_time(tmp_path):
         "every take has a model with these parameters"
         in _run("fit", db, "--refit", "--eta", "1.35").stderr
     )
-    picture = ("--light", "l000", "--spp", "8", "--scale", "0.5")
+    picture = ("--light", "l000", "--spp", "8", "--size", "80")
     assert (
         _run(
             "render", db, "--out", str(tmp_path / "pictures"), *picture, *two
@@ -776,7 +776,7 @@ def test_cli__an_earlier_generation_is_shown(small_database, tmp_path):
         stage.write(groups)
         stage.commit(model.attrs)
     old = ("--generation", str(first_generation))
-    picture = ("--light", "l000", "--scale", "0.3", "--spp", "8")
+    picture = ("--light", "l000", "--size", "48", "--spp", "8")
     for name, more in (("new", ()), ("old", old)):
         assert (
             _run(

@@ -45,7 +45,7 @@ LOGGED = [
         {"explain": True},
     ),
     (
-        ("render", "{db}", "S02", "--out", "{out}/a.png", "--scale", "0.1"),
+        ("render", "{db}", "S02", "--out", "{out}/a.png", "--size", "16"),
         "render",
         ("S02",),
         {},

@@ -50,11 +50,15 @@ TAKES = click.argument("takes", metavar="[TAKE...]", nargs=-1)
 @click.option(
     "--out",
     type=PATH,
-    required=True,
     help=(
         "Picture of one take (.exr linear, .png tone-mapped), or folder for <take>.png "
         "of every take."
     ),
+)
+@click.option(
+    "--turntable",
+    type=PATH,
+    help="Animated picture of one take (.webp) from left to right and back, instead of --out.",
 )
 @options_of(RenderParameters)
 @click.option("--edited", is_flag=True, help="Render the edited models.")
@@ -67,7 +71,8 @@ TAKES = click.argument("takes", metavar="[TAKE...]", nargs=-1)
 def render(
     db: str,
     takes: tuple[str, ...],
-    out: Path,
+    out: Path | None,
+    turntable: Path | None,
     edited: bool,
     parameters: RenderParameters,
     **request: Any,
@@ -78,14 +83,20 @@ def render(
     """
     database = existing(db)
     chosen = chosen_takes(database, takes, "edit" if edited else "model")
-    if out.suffix:
-        writable(out, ".exr", ".png")
-        require_one_take(out, chosen)
+    written = turntable or out
+    if written is None or (turntable and out):
+        raise click.UsageError("give either --out or --turntable")
+    if turntable:
+        writable(turntable, ".webp")
+    elif written.suffix:
+        writable(written, ".exr", ".png")
+    if written.suffix:
+        require_one_take(written, chosen)
     request["edited"] = edited
     call = partial(
         workflow.render_take,
         database,
-        shared_path(out),
+        shared_path(written),
         **request,
         **vars(parameters),
     )

@@ -9,6 +9,7 @@ from pathlib import Path
 import imagecodecs
 import numpy as np
 import OpenEXR
+import PIL.Image
 from numpy.typing import ArrayLike
 
 from skindb.errors import input_error
@@ -18,6 +19,7 @@ from skindb.types import AnyArray, Bytes, Float32, Float64, Mask, float64
 
 Image = Float32
 DAMAGED = "a file that is cut off, damaged or of another format"
+FRAME_MS = 80  # of an animation
 WHITE_QUANTILE = 0.995  # fraction of the lit pixels that a display image does not clip
 
 
@@ -79,6 +81,13 @@ def write_png(path: str | Path, picture: AnyArray) -> None:
     private_file(path).write_bytes(
         imagecodecs.png_encode(np.ascontiguousarray(picture))
     )
+
+
+def write_webp(path: str | Path, frames: Sequence[Bytes]) -> None:
+    """Write an endless animation of sRGB pictures (h, w, 3) or (h, w, 4) as WebP."""
+    first, *others = map(PIL.Image.fromarray, frames)
+    options = {"append_images": others, "duration": FRAME_MS, "loop": 0, "quality": 90}
+    first.save(private_file(path), "WEBP", save_all=True, **options)
 
 
 def image_url(picture: Bytes) -> str:

@@ -15,7 +15,13 @@ import xarray as xr
 from skindb.errors import require
 from skindb.geometry.rays import RayScene
 from skindb.parameters import RenderParameters
-from skindb.render.image import auto_exposure, tone_map, write_exr, write_png
+from skindb.render.image import (
+    auto_exposure,
+    tone_map,
+    write_exr,
+    write_png,
+    write_webp,
+)
 from skindb.render.monte_carlo import Quality, Rendering, render_monte_carlo
 from skindb.render.plan import KEPT, ScenePlan, plan_scene
 from skindb.render.scene import (
@@ -40,8 +46,15 @@ from skindb.render.shading import (
     tree_opening,
 )
 from skindb.render.subsurface import refined_surface
+from skindb.render.views import (
+    VIEW_PX,
+    VIEWS,
+    camera_around,
+    light_from,
+    turntable_azimuths,
+)
 from skindb.schema.consent import honour_consent
-from skindb.types import Float32, Progress, dots, lengths
+from skindb.types import Bytes, Float32, Progress, dots, lengths
 
 UNITS = "radiance"  # in the unit of the photographs, or of the environment
 NO_LIGHTS = Lights(
@@ -344,16 +357,17 @@ def render_picture(
         Version of kind "model" or "edit".
     out
         Picture to write. An EXR has the channels R, G, B, A (coverage) and variance.R,
-        variance.G, variance.B.
+        variance.G, variance.B. A WebP is animated: the view swings around the face.
     explain
         Only plan the picture and write nothing.
     **options
         Of `skindb.parameters.RenderParameters`: lights, environment, camera, samples,
-        error, seed, scale and subsurface as in `render`, and exposure, a factor on the
-        radiance of a PNG. The exposure "fixed" shows a white matte surface, which
-        stands in the place of the face and faces the camera, as display white, so that
-        pictures under the same light are comparable. "auto" shows the brightest skin as
-        display white.
+        error, seed and subsurface as in `render`; view and light_from, a camera and a
+        light beside the dome; size, the width in pixels; alpha, whether the background is
+        transparent; and exposure, a factor on the radiance. The exposure "fixed" shows a
+        white matte surface, which stands in the place of the face and faces the camera (the
+        front for a view), as display white, so that pictures under the same light are
+        comparable. "auto" shows the brightest skin as display white.
 
     Returns
     -------
@@ -367,40 +381,100 @@ def render_picture(
     InputError
         If an option is out of its limits, and as `render`.
     """
+    endings = (".exr", ".png", ".webp")
     require(
-        out.suffix in (".exr", ".png"),
+        out.suffix in endings,
         str(out),
-        "the name of a picture must end in .exr or .png",
+        f"the name of a picture must end in {', '.join(endings)}",
         out.suffix or "no suffix",
         "change the name",
     )
-    settings = dict(vars(RenderParameters(**options)))
-    exposure = settings.pop("exposure")
-    view = {key: settings[key] for key in ("lights", "environment", "camera", "scale")}
+    parameters = RenderParameters(**options)
+    shots = _shots(model, parameters, turning=out.suffix == ".webp")
+    error = parameters.error
     if explain:
         inputs = render_inputs(
-            model, **view, subsurface=settings["subsurface"], error=settings["error"]
+            model, **shots[0], subsurface=parameters.subsurface, error=error
         )
         skipped = [str(omission) for omission in inputs.plan.omissions]
         return {"path": str(out), **inputs.names, "skipped": skipped, "kept": KEPT}
-    seen = render(model, **settings)
+    names = ("samples", "error", "subsurface", "seed")
+    settings = {name: getattr(parameters, name) for name in names}
+    frames = [render(model, **shot, **settings) for shot in shots]
+    seen = frames[0]
     summary = {"path": str(out)} | {
-        key: seen.attrs[key] for key in ("camera", "lights", "environment", "skipped")
+        key: value for key, value in seen.attrs.items() if key != "seconds"
     }
-    summary |= {
-        key: seen.attrs[key] for key in ("samples", "relative_error", "seconds")
-    }
-    radiance = seen["radiance"].values
+    summary["seconds"] = sum(frame.attrs["seconds"] for frame in frames)
     if out.suffix == ".exr":
         _write_exr(out, seen)
         return summary
-    if exposure == "fixed":
-        inputs = render_inputs(model, **view, subsurface=False)
+    if parameters.exposure == "fixed":
+        shot = shots[0]
+        if parameters.view in VIEWS:  # the same for all of them
+            front = camera_around(from_model(model), VIEWS["front"], VIEW_PX)
+            shot = shot | {"camera": front}
+        inputs = render_inputs(model, **shot, subsurface=False)
         gain = fixed_exposure(inputs.given, inputs.camera)
+    elif parameters.exposure == "auto":
+        gain = auto_exposure(seen["radiance"].values)
     else:
-        gain = auto_exposure(radiance) if exposure == "auto" else float(exposure)
-    write_png(out, tone_map(radiance, exposure=gain))
+        gain = parameters.exposure
+    pictures = [_displayed(frame, gain, alpha=parameters.alpha) for frame in frames]
+    if out.suffix == ".webp":
+        write_webp(out, pictures)
+    else:
+        write_png(out, pictures[0])
     return summary | {"exposure": gain}
+
+
+def _shots(
+    model: xr.DataTree, parameters: RenderParameters, *, turning: bool
+) -> list[dict[str, Any]]:
+    """Lights, environment, camera and scale of each frame; one, or those of a turntable."""
+    chosen = {
+        "camera": parameters.camera is not None,
+        "view": parameters.view in VIEWS,
+        "turntable": turning,
+        "light": len(parameters.lights) > 0,
+        "light_from": parameters.light_from is not None,
+    }
+    for names in (("camera", "view", "turntable"), ("light", "light_from")):
+        given = [name for name in names if chosen[name]]
+        rule = "only one of them may be given"
+        require(len(given) < 2, " and ".join(given), rule, "both", "omit one")
+    surface = from_model(model)
+    shot: dict[str, Any] = {
+        "lights": parameters.lights,
+        "environment": parameters.environment,
+        "camera": parameters.camera,
+        "scale": 1.0,
+    }
+    if parameters.light_from is not None:
+        shot["lights"] = light_from(surface, parameters.light_from)
+    size = parameters.size
+    if not chosen["view"] and not turning:
+        if size is not None:
+            dome = model["dome"].to_dataset().load()
+            shot["scale"] = size / chosen_camera(dome, parameters.camera)[0].width
+        return [shot]
+    azimuths = turntable_azimuths() if turning else [VIEWS[parameters.view]]
+    width = size or VIEW_PX
+    return [
+        shot | {"camera": camera_around(surface, azimuth, width)}
+        for azimuth in azimuths
+    ]
+
+
+def _displayed(seen: xr.Dataset, exposure: float, *, alpha: bool) -> Bytes:
+    """The picture as sRGB (h, w, 3), or (h, w, 4) with its coverage."""
+    radiance = seen["radiance"].values
+    if not alpha:
+        return tone_map(radiance, exposure=exposure)
+    coverage = seen["coverage"].values[..., None]
+    colour = radiance / np.maximum(coverage, 1e-6)
+    opacity = np.round(255 * coverage).astype(np.uint8)
+    return np.concatenate([tone_map(colour, exposure=exposure), opacity], axis=-1)
 
 
 def fixed_exposure(lighting: Lighting, camera: Camera) -> float:

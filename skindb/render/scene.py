@@ -103,10 +103,10 @@ class Camera(Pinhole):
         height = round(self.height * factor)
         require(
             1 <= width * height <= MAX_PICTURE_PIXELS,
-            "scale",
+            "size",
             f"a picture must have 1 to {MAX_PICTURE_PIXELS:,} pixels",
             f"{width} x {height}",
-            "choose a smaller scale",
+            "choose another size",
         )
         K = np.diag([factor, factor, 1.0]) @ self.K
         return replace(self, K=K, width=width, height=height)

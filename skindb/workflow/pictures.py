@@ -24,7 +24,8 @@ from skindb.render.rendering import (
     render,
     render_picture,
 )
-from skindb.render.scene import Camera, Environment, Lighting, Lights, lights_from_dome
+from skindb.render.scene import Camera, Environment, Lighting, from_model
+from skindb.render.views import light_from
 from skindb.schema import variables
 from skindb.store import STUDY, Database, intact_or_none, require_fresh
 from skindb.types import Progress, float64, silent
@@ -46,11 +47,8 @@ from skindb.workflow.edits import editable_model
 
 SIDE_PX = 320  # of a picture
 CLOSE_MM = 40.0  # side of a close-up
-# from the front to the subject's left, and the rise over the distance along it: the shadow
-# of the nose is on the cheek, which is lit around it
-LIGHT_DEGREES = 42.0
-LIGHT_RISE = 0.4
-LIGHT_MM = 800.0  # from the nose
+# the shadow of the nose is on the cheek, which is lit around it
+LIGHT = "42,22"
 LANDMARK = "nose_tip"
 COMPONENTS = "components"  # study of modes
 MODE_END = 2.0  # standard deviations at the ends of its slider
@@ -254,7 +252,7 @@ def translucency_grid(
         progress("render", i, 2)
         take = extreme(lengths, key=lengths.__getitem__)
         model = db.read("model", take)
-        light = _light(model)
+        light = light_from(from_model(model), LIGHT)
         camera = _close_up(model)
         rows[f"{take}\n{lengths[take]:.2f} mm"] = [
             render(
@@ -292,21 +290,6 @@ def _nose(model: DataTree) -> np.ndarray[Any, np.dtype[np.float64]]:
         return float64(mesh[variables.LANDMARK_POSITION].sel(landmark=LANDMARK).values)
     return float64(
         model["fitted"].dataset[variables.SURFEL_POSITION].values.mean(axis=0)
-    )
-
-
-def _light(model: DataTree) -> Lights:
-    """A small light to the subject's left, above the nose."""
-    turn = np.radians(LIGHT_DEGREES)
-    towards = np.array([np.sin(turn), LIGHT_RISE, np.cos(turn)])
-    towards /= np.linalg.norm(towards)
-    power = np.median(lights_from_dome(model["dome"].dataset).intensity, axis=0)[None]
-    return Lights(
-        _nose(model)[None] + LIGHT_MM * towards,
-        power,
-        np.full(1, 2.0),
-        -towards[None],
-        np.zeros(1),
     )
 
 
