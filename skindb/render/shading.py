@@ -39,6 +39,9 @@ ERROR_PER_OPENING = 0.015
 
 Image = Float32
 TERMS = ("diffuse", "surface")
+# of shading normals: on triangles that are seen at a grazing angle they may face away, and the
+# outline of a nose would be a black line
+MIN_VIEW_COSINE = 0.05
 GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
 
 
@@ -277,8 +280,9 @@ def trace_view(
     point of each. With `pixels` (h, w), only the rays of these pixels are traced; they
     do not depend on it.
 
-    Hits are discarded if the triangle is seen from behind or its shading normal faces
-    away. There the surface occludes but reflects no light.
+    Hits are discarded if the triangle is seen from behind; there the surface occludes but
+    reflects no light. A shading normal that faces away from the camera, or nearly so,
+    although its triangle does not, is turned until its cosine is MIN_VIEW_COSINE.
     """
     rays = RayScene(surface.vertices, surface.faces) if scene is None else scene
     offset = (np.arange(samples) + 0.5) / samples
@@ -324,7 +328,7 @@ def _facing_points(
     surface: Surface, camera: Camera, corners: Index, weight: Array
 ) -> tuple[Array, Array, Array, Array, Mask]:
     """Positions, unit normals, directions to the camera and `View.tint` (n, 3) of hits, and
-    whether the surface and its shading normal face the camera.
+    whether the surface faces the camera.
     """
     tint = np.ones((1, 1))
     normal = np.einsum("nk,nkc->nc", weight, surface.normals[corners])
@@ -339,7 +343,9 @@ def _facing_points(
         towards = camera.centre - position
         towards = unit(towards)
         facet = face_crosses(surface.vertices, corners)
-        facing = (dots(normal, towards) > 0) & (dots(facet, towards) > 0)
+        facing = (dots(facet, towards) > 0) & finite_rows(normal)
+        lacking = np.maximum(MIN_VIEW_COSINE - dots(normal, towards), 0)
+        normal = unit(normal + lacking[:, None] * towards)
     return position, normal, towards, tint, facing
 
 

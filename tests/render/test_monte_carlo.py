@@ -117,7 +117,7 @@ def test_furnace__a_white_ball_vanishes() -> None:
 
 def test_furnace__a_lobe_has_its_directional_albedo() -> None:
     surface = ball(diffuse=0.0, weight=1.0)
-    found = rendered(surface, EVEN, samples=128)
+    found = rendered(surface, EVEN, samples=256)
     view = trace_view(surface, camera(), samples=8)
     cosine = np.einsum("nc,nc->n", view.normal, view.towards)
     at = np.linspace(0.05, 1, 60)
@@ -125,8 +125,8 @@ def test_furnace__a_lobe_has_its_directional_albedo() -> None:
     expected = view.image(np.repeat(albedo[:, None], 3, axis=1))
     middle = (expected > 0) & (found.coverage == 1)[..., None]
     gap = (found.radiance - expected)[middle].mean() / expected[middle].mean()
-    # noise 0.1 %; the expected picture by 64 rays, and quadrature at grazing angles
-    assert abs(gap) < 0.005
+    # noise of the mean 0.35 %; the expected picture by 64 rays
+    assert abs(gap) < 0.01
 
 
 def test_subsurface__even_light_gives_r_d() -> None:

@@ -10,11 +10,18 @@ import numpy as np
 import pytest
 import trimesh
 
+from skindb.geometry.mesh import vertex_normals
 from skindb.geometry.rays import RayScene
 from skindb.optics.diffusion import dipole_s
 from skindb.reflectance.mixture import Mixture
 from skindb.render.scene import Camera, Lights, Surface
-from skindb.render.shading import exitances, trace_view, transmitted_irradiance
+from skindb.render.shading import (
+    exitances,
+    shade_view,
+    trace_view,
+    transmitted_irradiance,
+)
+from skindb.virtual.head import FaceShape, parametric_head
 from tests.pictures import render_view
 
 FLOAT32 = 2e-6
@@ -327,3 +334,47 @@ def test_trace_view__detail_of_texels() -> None:
     # columns beside the middle mix both halves
     assert shown[..., :11, :3] == pytest.approx(half[..., :11, :3], rel=1e-5)
     assert shown[..., 13:, :3] == pytest.approx(whole[..., 13:, :3], rel=1e-5)
+
+
+def test_trace_view__the_outline_of_a_nose_is_not_black() -> None:
+    """Every triangle that faces the camera reflects light, although at the outline, on triangles
+    of 4 mm, shading normals face away.
+    """
+    head = parametric_head(FaceShape(), spacing_mm=4.0)
+    n = len(head.vertices)
+    nose = head.vertices[head.vertices[:, 2].argmax()]
+    towards = np.array([np.sin(0.7), 0, np.cos(0.7)])
+    R = np.stack([[np.cos(0.7), 0, -np.sin(0.7)], [0, -1, 0], -towards])
+    K = np.array([[600.0, 0, 40], [0, 600, 40], [0, 0, 1]])
+    camera = Camera(K, R, -R @ (nose + 400 * towards), np.zeros(5), 80, 80)
+    normals = vertex_normals(head.vertices, head.faces)
+    surface = Surface(
+        head.vertices,
+        head.faces,
+        normals,
+        np.ones((n, 3)),
+        np.zeros((n, 1)),
+        Mixture(np.zeros((4, 4, 4, 1), np.float32)),
+        eta=1.0,
+    )
+    scene = RayScene(surface.vertices, surface.faces)
+    row, column = np.divmod(np.arange(80 * 80), 80)
+    rays = camera.rays(np.stack([column, row], axis=1) + 0.5)
+    face, weight, _ = scene.first_hit(np.broadcast_to(camera.centre, rays.shape), rays)
+    corners = head.vertices[head.faces[face]]
+    facet = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    front = (face >= 0) & (np.einsum("nc,nc->n", facet, rays) < 0)
+    shading = np.einsum("nk,nkc->nc", weight, normals[head.faces[face]])
+    away = front & (np.einsum("nc,nc->n", shading, rays) > 0)
+    assert away.sum() > 5
+    view = trace_view(surface, camera, scene=scene)
+    np.testing.assert_array_equal(view.coverage.ravel() == 1, front)
+    lamp = Lights(
+        camera.centre[None],
+        np.full((1, 3), 400.0**2),
+        np.zeros(1),
+        -towards[None],
+        np.zeros(1),
+    )
+    picture = shade_view(view, surface, lamp, scene)[0]
+    assert picture.reshape(-1, 3)[away].min() > 0
