@@ -43,13 +43,15 @@ MEAN_FREE_PATH_PER_ALBEDO = 0.4
 
 def texture_size(model: xr.DataTree) -> int:
     """Texels along each side of maps without loss: 1.5 per spacing of the surfels,
-    rounded up to a power of two.
+    rounded up to a power of two, and at least those of the detail.
     """
     uv = model["fitted"].dataset[variables.SURFEL_UV].values
     triangles = model["mesh"].dataset[variables.TRIANGLE].values
     corners = uv.astype(float)[triangles]
     edge = np.median(lengths(corners - np.roll(corners, 1, axis=1)))
     texels = TEXELS_PER_SPACING / max(float(edge), 1e-6)
+    if "detail" in model.children:
+        texels = max(texels, model["detail"].sizes["v"])
     return int(np.clip(2 ** np.ceil(np.log2(texels)), MIN_SIZE, MAX_SIZE))
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from scipy import ndimage
 from scipy.sparse import csr_array
+from skimage.transform import resize
 
 from skindb.export.inputs import chosen_size, mean_free_path, required
 from skindb.geometry.atlas import atlas_values, push_pull, rasterise_atlas
@@ -109,6 +110,27 @@ class Atlas:
         return {name: images[name] for name in parts if name in images}
 
 
+def texel_detail(
+    model: xr.DataTree, atlas: Atlas, axes: Float64, trust: Float32
+) -> dict[str, Image]:
+    """What the detail of a model does to its maps (size, size, 3): "albedo" is a factor;
+    "normal" and "normal_tangent" are added. Empty without detail.
+
+    `axes` are the `tangent_axes` (n, 3, 3) of the surfels.
+    """
+    if "detail" not in model.children:
+        return {}
+    maps = model["detail"].dataset
+    size = atlas.raster[0].shape
+    albedo, normal = (
+        resize(maps[name].values.astype(np.float32), size, anti_aliasing=True)
+        for name in (variables.DIFFUSE_DETAIL, variables.NORMAL_DETAIL)
+    )
+    frames = atlas.spread(axes.reshape(-1, 9), trust).reshape(*size, 3, 3)
+    turned = np.einsum("vukc,vuc->vuk", frames, normal)
+    return {"albedo": 1 + albedo, "normal": normal, "normal_tangent": turned}
+
+
 def texture_maps(
     model: xr.DataTree, *, size: int | None = None
 ) -> dict[str, TextureMap]:
@@ -127,7 +149,7 @@ def texture_maps(
     dict
         Maps by name:
 
-        - `albedo`
+        - `albedo`, like the normals with the detail of texels if the model has it
         - `normal`: unit vectors in the subject frame
         - `normal_tangent`: the same in the tangent frames of the mesh, see `tangent_frames`
         - `weight_<k>` per component
@@ -151,13 +173,16 @@ def texture_maps(
         for channel, column in zip(_channels(values), values.T, strict=True)
     }
     images = atlas.spread_known(columns, trust)
+    detail = texel_detail(model, atlas, _surfel_axes(fitted, atlas.triangles), trust)
     maps = {}
     for name, (values, units, doc) in layers.items():
         channels = tuple(c for c in _channels(values) if f"{name} {c}" in images)
         if channels:
             planes = np.concatenate([images[f"{name} {c}"] for c in channels], axis=-1)
+            if name == "albedo":
+                planes = planes * detail.get(name, 1)
             if name in ("normal", "normal_tangent"):
-                planes = unit(planes)
+                planes = unit(planes + detail.get(name, 0))
             maps[name] = TextureMap(planes, channels, units, doc)
     status = texel_codes(surfel_texels(fitted), atlas.triangles, *atlas.raster)
     for name, plane, doc in (
@@ -180,11 +205,7 @@ def _layers(fitted: xr.Dataset, triangles: AnyArray) -> dict[str, Layer]:
     surfels are independent.
     """
     shading = fitted[variables.SHADING_NORMAL].values
-    mesh = fitted[variables.SURFEL_NORMAL].values.astype(float)
-    uv = fitted[variables.SURFEL_UV].values
-    frames = tangent_frames(
-        fitted[variables.SURFEL_POSITION].values, mesh, uv, triangles
-    )
+    axes = _surfel_axes(fitted, triangles)
     layers: dict[str, Layer] = {
         "albedo": (
             even_diffuse(fitted),
@@ -197,7 +218,7 @@ def _layers(fitted: xr.Dataset, triangles: AnyArray) -> dict[str, Layer]:
             "unit shading normal, with x, y, z of the subject frame in R, G, B",
         ),
         "normal_tangent": (
-            to_tangent_space(shading, mesh, frames).astype(np.float32),
+            np.einsum("nkc,nc->nk", axes, shading).astype(np.float32),
             "1",
             "unit shading normal, with its parts along tangent, bitangent (towards "
             "v = 0) and normal in R, G, B",
@@ -227,6 +248,14 @@ def _layers(fitted: xr.Dataset, triangles: AnyArray) -> dict[str, Layer]:
             values = fitted[variable].values.reshape(len(shading), -1)
             layers[name] = (values, spec.units, spec.doc)
     return layers
+
+
+def _surfel_axes(fitted: xr.Dataset, triangles: AnyArray) -> Float64:
+    """`tangent_axes` (n, 3, 3) of the surfels, with the normals of the mesh."""
+    position = fitted[variables.SURFEL_POSITION].values
+    normal = fitted[variables.SURFEL_NORMAL].values.astype(float)
+    uv = fitted[variables.SURFEL_UV].values
+    return tangent_axes(normal, tangent_frames(position, normal, uv, triangles))
 
 
 def tangent_frames(
@@ -269,10 +298,9 @@ def tangent_frames(
     return np.concatenate([tangent, sign[:, None]], axis=1)
 
 
-def to_tangent_space(direction: Array, normal: Array, tangent: Array) -> Float64:
-    """Coordinates (n, 3) of directions along tangent, bitangent and normal, see
-    `tangent_frames`.
+def tangent_axes(normal: Array, tangent: Array) -> Float64:
+    """Tangent, bitangent and normal (n, 3, 3), one per row, see `tangent_frames`. Their
+    products with a direction are its coordinates in the tangent frame.
     """
     bitangent = np.cross(normal, tangent[:, :3]) * tangent[:, 3:]
-    axes = (tangent[:, :3], bitangent, normal)
-    return np.stack([dots(direction, axis) for axis in axes], axis=1)
+    return np.stack([tangent[:, :3], bitangent, normal], axis=1)

@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from skindb.export.inputs import chosen_size, required
-from skindb.export.maps import Atlas, tangent_frames, to_tangent_space
+from skindb.export.maps import Atlas, tangent_axes, tangent_frames, texel_detail
 from skindb.optics.angles import directions
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.kinds import as_mixture, even_diffuse
@@ -368,7 +368,8 @@ def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
     ]
     shape = _shape(fitted, model["mesh"].dataset[variables.TRIANGLE].values)
     top = float(max(skin.f0.max(), MIN_F0))
-    bent = to_tangent_space(shape.shading, shape.normal, shape.tangent)
+    axes = tangent_axes(shape.normal, shape.tangent)
+    bent = np.einsum("nkc,nc->nk", axes, shape.shading)
     columns = np.zeros((len(trust), 9), np.float32)
     columns[trusted] = np.column_stack(
         [
@@ -380,8 +381,13 @@ def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
         ]
     )
     atlas = Atlas.of(model, chosen_size(model, size))
-    pictures = _textures(atlas.spread(columns, trust))
-    return Skin(pictures, shape, top, max(mean_f0, MIN_F0), reflection, *errors)
+    planes = atlas.spread(columns, trust)
+    if detail := texel_detail(model, atlas, axes, trust):
+        planes[..., :3] *= detail["albedo"]
+        planes[..., 6:] += detail["normal_tangent"]
+    return Skin(
+        _textures(planes), shape, top, max(mean_f0, MIN_F0), reflection, *errors
+    )
 
 
 @dataclass(frozen=True)

@@ -60,6 +60,7 @@ KEPT = (  # measured by benchmarks/omissions.py on a face of 23,393 surfels
     ),
     "not skipped: lights of the surroundings, because none is below the horizon of all surfels",
 )
+DETAIL = "skipped: the detail of texels, which pictures and exports show"
 KINDS = {"float16": "f2", "float32": "f4", "uint32": "u4"}
 
 
@@ -208,7 +209,9 @@ def page_omissions(model: xr.DataTree, *, edited: bool = False) -> list[str]:
     edited
         Whether the page has sliders of traits, which require all bases.
     """
-    return [*map(str, _surface(model, edited=edited)[1]), *MEASURED, *KEPT]
+    surface, omissions = _surface(model, edited=edited)
+    detail = [] if surface.detail is None else [DETAIL]
+    return [*map(str, omissions), *detail, *MEASURED, *KEPT]
 
 
 def _surface(

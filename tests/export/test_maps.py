@@ -5,8 +5,10 @@ import pytest
 import xarray as xr
 
 from skindb.errors import InputError
+from skindb.export.inputs import texture_size
 from skindb.export.maps import texture_maps
-from skindb.schema import FitStatus, TexelStatus, label
+from skindb.export.textures import skin_of
+from skindb.schema import FitStatus, TexelStatus, dataset, label
 
 SIZE = 64
 
@@ -277,3 +279,39 @@ def test_texture_maps__surfels_of_three_samples_are_matt(model: xr.DataTree) -> 
         maps["albedo"].values[inner, 0], 0.2 + 0.5 * u[inner], atol=2e-3
     )
     np.testing.assert_allclose(maps["confidence"].values[inner], 0.5, atol=1e-6)
+
+
+def test_texture_maps__detail_of_texels(model: xr.DataTree) -> None:
+    """Rationale: a factor and a tilt that are the same everywhere are those of surfels with
+    this albedo and these normals. Expected: the same maps up to half precision.
+    """
+    size = 2 * SIZE
+    tilt = np.array([0.1, -0.2, 0.05], np.float16)
+    planted = model.copy()
+    planted["detail"] = xr.DataTree(
+        dataset(
+            {
+                "diffuse_detail": np.full((size, size, 3), [0.25, -0.5, 0.5]),
+                "normal_detail": np.full((size, size, 3), tilt),
+            }
+        )
+    )
+    assert texture_size(planted) == size
+    maps = texture_maps(planted)
+    fitted = model["fitted"].to_dataset()
+    normal = fitted["shading_normal"] + tilt
+    model["fitted"] = fitted.assign(
+        diffuse_reflectance=fitted["diffuse_reflectance"] * [1.25, 0.5, 1.5],
+        shading_normal=normal,
+    )
+    expected = texture_maps(model, size=size)
+    sure = expected["confidence"].values[..., 0] > 0.999
+    for name in ("albedo", "normal", "normal_tangent"):
+        np.testing.assert_allclose(
+            maps[name].values[sure], expected[name].values[sure], atol=1e-3
+        )
+    skins = [skin_of(tree, size=size).pictures for tree in (planted, model)]
+    # in steps of 1/255; the base colour is not quite proportional to R_d
+    for name, steps in (("normal", 1), ("baseColor", 6)):
+        ours, theirs = (skin[name].astype(int)[sure] for skin in skins)
+        assert np.abs(ours - theirs).max() <= steps
