@@ -80,7 +80,7 @@ class Detail:
             return None
         in_map = np.abs(signed_areas(surfels.uv, surfels.faces)).sum()
         width = np.sqrt(surfels.area.sum() / in_map)  # mm of the map
-        size = min(int(2 ** np.ceil(np.log2(width / pixel))), MAX_TEXELS)
+        size = min(64 * int(np.ceil(width / pixel / 64)), MAX_TEXELS)
         face, weight = rasterise_atlas(surfels.uv, surfels.faces, size)
         texel = np.flatnonzero(face >= 0)
         count = len(surfels.position)
