@@ -15,7 +15,13 @@ import skindb
 from skindb.cli.captures import demo, ingest, simulate
 from skindb.cli.fitting import dictionary_command, fit
 from skindb.cli.imports import import_command, quick
-from skindb.cli.laboratory import calibrate, capture, check_device, landmarks
+from skindb.cli.laboratory import (
+    calibrate,
+    capture,
+    check_device,
+    landmarks,
+    register_scan,
+)
 from skindb.cli.pictures import compare, export, render, show, view
 from skindb.cli.population import edit, register, reproduce
 from skindb.cli.shared import echo_json, fault_lines
@@ -31,7 +37,7 @@ INTERRUPTED = 130
 
 SECTIONS = {
     "Try": (demo, simulate, quick),
-    "Laboratory": (calibrate, capture, check_device, landmarks),
+    "Laboratory": (calibrate, capture, check_device, landmarks, register_scan),
     "Measure": (import_command, ingest, fit, compare, dictionary_command),
     "Population": (register, analyze, tidy, edit, reproduce),
     "Pictures": (show, render, view, export),

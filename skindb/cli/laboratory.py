@@ -244,3 +244,50 @@ def landmarks(scan: Path, out: Path, port: int) -> None:
     """
     writable(out, ".json")
     serve(workflow.landmark_page(scan, out, port=port), out=str(out))
+
+
+@command
+@click.argument("scan", type=PATH)
+@click.option(
+    "--landmarks", type=PATH, required=True, help="Landmarks of the scan (.json)."
+)
+@click.option(
+    "--seen",
+    type=PATH,
+    required=True,
+    help='Pixels of landmarks in photographs (.json): {"c00": {"nose_tip": [812, 633], ...}, '
+    "...}, three or more landmarks in two cameras each.",
+)
+@click.option(
+    "--capture",
+    "folder",
+    type=PATH,
+    required=True,
+    help="Capture folder with the dome and the photographs.",
+)
+@click.option(
+    "--out",
+    type=PATH,
+    required=True,
+    help="New folder for scan.ply, landmarks.json and pose.json.",
+)
+def register_scan(
+    scan: Path, landmarks: Path, seen: Path, folder: Path, out: Path
+) -> None:
+    """Move SCAN from the frame of its scanner into that of the dome.
+
+    The landmarks on the scan and in photographs give the position, which the comparison of
+    the photographs with the scan improves. The scan may be in mm, cm, inch or m.
+    """
+    report = workflow.register_scan(scan, landmarks, seen, folder, out, progress=bar())
+    distances = report["landmarks_px"]
+    farthest = max(distances, key=distances.get)
+    lines = [
+        f"{out}: the scan is in {report['unit']}; landmarks are {report['rms_px']:.1f} px "
+        f"(rms) from where they are seen, at most {distances[farthest]:.1f} ({farthest})",
+        "the photographs show too little of the face to improve the position"
+        if report["shift_mm"] is None
+        else f"the photographs moved it by {report['shift_mm']:.2f} mm and "
+        f"{report['turn_degrees']:.2f} degrees in the last round",
+    ]
+    emit(report, lines)

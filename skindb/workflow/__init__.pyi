@@ -50,6 +50,7 @@ from .pictures import (
 )
 from .quicklook import quick
 from .rig import calibrate_rig, describe_rig
+from .scan import register_scan
 from .session import capture_session, check_device, plan_session
 from .simulation import begin_simulation, simulate
 from .studies import STUDY_FUNCTIONS, study, tidy_table
@@ -107,6 +108,7 @@ __all__ = [
     "quick",
     "record_consent",
     "refresh",
+    "register_scan",
     "register_takes",
     "registered_datasets",
     "render_take",

@@ -1,0 +1,176 @@
+"""Moving a scan from the frame of its scanner into that of the dome."""
+
+import json
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+import xarray as xr
+from scipy.spatial.transform import Rotation
+
+from skindb.calibration.setup import read_setup_dome
+from skindb.errors import Fault, require_none
+from skindb.files import Json, make_private, private_file
+from skindb.format.fields import Fields, read_json
+from skindb.format.folder import read_capture
+from skindb.geometry.scan import Scan, read_scan
+from skindb.geometry.scan_pose import moved, rigid, scan_pose
+from skindb.ingest.capture import ingest_capture
+from skindb.parameters import IngestParameters
+from skindb.schema import variables
+from skindb.types import Array, Float64, Progress, float64, silent
+
+ROUNDS = (
+    3  # of the comparison with the photographs, each of which starts at the last pose
+)
+CHECK = IngestParameters(
+    spacing_mm=4.0, photographs=0, calibration="note", refine=False
+)
+KEYS = ("mesh", "landmarks")  # of capture.json
+FILES = ("scan.ply", "landmarks.json")
+
+
+def register_scan(
+    scan: Path,
+    landmarks: Path,
+    seen: Path,
+    capture: Path,
+    out: Path,
+    *,
+    progress: Progress = silent,
+) -> Json:
+    """Write a scan and its landmarks in mm in the frame of a dome.
+
+    The pose is that for which the landmarks appear where they are seen in the photographs;
+    then the photographs are compared with the scan at this pose, as ingest does.
+
+    Parameters
+    ----------
+    scan, landmarks
+        Mesh (.ply, .obj) and JSON file {name: [x, y, z]}, in the same unit and frame.
+    seen
+        JSON file {camera: {name: [column, row]}} with pixels of photographs.
+    capture
+        Capture folder with the dome and the photographs; its own scan is not used.
+    out
+        New folder for scan.ply, landmarks.json and pose.json.
+    progress
+        Called with the stage, the number of finished steps and the total number of steps.
+
+    Returns
+    -------
+    dict
+        unit, matrix (4, 4), landmarks_px (distance by camera and landmark), rms_px, and
+        by the photographs the last shift_mm and turn_degrees, None if they show too little
+        of the face.
+
+    Raises
+    ------
+    InputError
+        If a file is faulty, or the landmarks do not determine the pose.
+    """
+    faults = list[Fault]()
+    if taken := [name for name in (*FILES, "pose.json") if (out / name).exists()]:
+        cure = "choose another folder"
+        faults.append(Fault(str(out), "must not hold them", ", ".join(taken), cure))
+    dome = read_setup_dome(capture, white=False, dark=False)
+    points = _points(landmarks, faults)
+    fields = Fields(read_json(seen, faults), str(seen), faults)
+    pixels: dict[tuple[str, str], Array] = {}
+    for camera in fields.data:
+        item = fields.object(camera)
+        if camera not in dome.camera_ids:
+            fields.fault(camera, "must be a camera of the dome", camera)
+        pixels |= {(camera, name): item.array(name, (2,)) for name in item.data}
+    require_none(faults)
+    mesh = read_scan(scan)
+    pose = scan_pose(points, pixels, {camera.id: camera for camera in dome.cameras})
+    matrix = pose.matrix
+    shift = turn = None
+    with tempfile.TemporaryDirectory(dir=capture.parent, prefix=".scan-") as folder:
+        copy = Path(folder) / "capture"
+        shutil.copytree(
+            capture, copy, copy_function=os.link, ignore=_without_scan(capture)
+        )
+        for i in range(ROUNDS):
+            progress("comparison with the photographs", i, ROUNDS)
+            _write(copy, mesh, points, matrix)
+            _dump(
+                copy / "capture.json",
+                _record(capture) | dict(zip(KEYS, FILES, strict=True)),
+            )
+            with ingest_capture(read_capture(copy), CHECK, scratch=folder) as tree:
+                found = _correction(tree)
+            if found is None:
+                break
+            correction, shift, turn = found
+            matrix = correction @ matrix
+    make_private(out)
+    _write(out, mesh, points, matrix)
+    distances = {f"{c} {name}": px for (c, name), px in pose.residuals.items()}
+    report = {
+        "unit": pose.unit,
+        "matrix": matrix.tolist(),
+        "landmarks_px": distances,
+        "rms_px": float(np.sqrt(np.mean(np.square(list(distances.values()))))),
+        "shift_mm": shift,
+        "turn_degrees": turn,
+    }
+    _dump(out / "pose.json", report)
+    return report
+
+
+def _points(path: Path, faults: list[Fault]) -> dict[str, Float64]:
+    fields = Fields(read_json(path, faults), str(path), faults)
+    return {name: fields.array(name, (3,)) for name in fields.data}
+
+
+def _record(capture: Path) -> Json:
+    """The content of capture.json."""
+    faults = list[Fault]()
+    record = read_json(capture / "capture.json", faults)
+    require_none(faults)
+    return dict(record)
+
+
+def _without_scan(capture: Path) -> Any:
+    """What is not linked, as it is written again."""
+    names = {"capture.json", *FILES, *(str(_record(capture).get(k)) for k in KEYS)}
+    return lambda folder, _: names if Path(folder) == capture else ()
+
+
+def _write(folder: Path, scan: Scan, points: dict[str, Float64], matrix: Array) -> None:
+    """Write the moved scan and landmarks."""
+    mesh = trimesh.Trimesh(
+        moved(matrix, scan.vertices),
+        scan.faces,
+        vertex_colors=scan.colours,
+        process=False,
+    )
+    mesh.export(private_file(folder / FILES[0]))
+    marks = {name: moved(matrix, point).tolist() for name, point in points.items()}
+    _dump(folder / FILES[1], marks)
+
+
+def _dump(path: Path, content: Any) -> None:
+    private_file(path).write_text(json.dumps(content, indent=1), encoding="utf-8")
+
+
+def _correction(tree: xr.DataTree) -> tuple[Float64, float, float] | None:
+    """Matrix (4, 4) that moves the scan to where the photographs show it, and its shift in
+    mm and turn in degrees; None if they show too little of the face.
+    """
+    calibration = tree["calibration"].to_dataset()
+    shift = calibration[variables.SCAN_TRANSLATION_ERROR].values
+    angles = calibration[variables.SCAN_ROTATION_ERROR].values
+    if not np.isfinite([*shift, *angles]).all():
+        return None
+    surfels = tree["surfels"].to_dataset()
+    middle = float64(surfels[variables.SURFEL_POSITION].values).mean(axis=0)
+    turn = Rotation.from_rotvec(angles, degrees=True)
+    matrix = rigid(turn, middle + shift - turn.apply(middle))
+    return matrix, float(np.linalg.norm(shift)), float(np.linalg.norm(angles))
