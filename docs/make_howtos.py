@@ -113,23 +113,19 @@ def diagrams() -> None:
 
 
 def chain(name: str, labels: Sequence[str]) -> None:
-    """Boxes from left to right, joined by arrows."""
-    body, x = "", 4.0
-    for label in labels:
-        width = 7 * len(label) + 20
-        if x > 4:
-            body += f'<path d="M{x - 34} 30h24m-7 -5l7 5l-7 5" fill="none" stroke="#8a6d5d"/>'
+    """Boxes below each other, joined by arrows."""
+    width = 7 * max(map(len, labels)) + 24
+    middle = width / 2 + 4
+    body = ""
+    for y, label in zip(range(4, 1000, 62), labels, strict=False):
+        if y > 4:
+            body += f'<path d="M{middle} {y - 24}v20m-5 -7l5 7l5 -7" fill="none" stroke="#8a6d5d"/>'
         body += (
-            f'<rect x="{x}" y="10" width="{width}" height="40" rx="5" {BOX}/>'
-            f'<text x="{x + width / 2}" y="34" text-anchor="middle">{label}</text>'
+            f'<rect x="4" y="{y}" width="{width}" height="36" rx="5" {BOX}/>'
+            f'<text x="{middle}" y="{y + 23}" text-anchor="middle">{label}</text>'
         )
-        x += width + 38
-    write(
-        name,
-        x - 30,
-        60,
-        f'<g font-family="sans-serif" font-size="13" fill="#333">{body}</g>',
-    )
+    style = 'font-family="sans-serif" font-size="13" fill="#333"'
+    write(name, width + 8, 62 * len(labels) - 18, f"<g {style}>{body}</g>")
 
 
 def photographs(capture: Path, folder: Path) -> None:
