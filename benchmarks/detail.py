@@ -257,9 +257,57 @@ def fine_rmse(rendered: Array, photograph: Comparison) -> float:
     return float(np.sqrt((fine[inside] ** 2).mean()))
 
 
+def print_recovery(seed: int, patch: Patch, model: xr.DataTree) -> None:
+    """Print the errors of R_d and normals at the texels, by surfels alone and with detail, and
+    how many true values are in the 95 % intervals.
+    """
+    fitted = model["fitted"].to_dataset()
+    detail = model["detail"].to_dataset()
+    surface = from_model(model)
+    face, weight = rasterise_atlas(
+        fitted["surfel_uv"].values, surface.faces, detail.sizes["v"]
+    )
+    errors = detail["diffuse_detail_error"].values.astype(float)
+    on = (face >= 0) & np.isfinite(errors).all(axis=2)
+    corners = surface.faces[face[on]]
+
+    def at_texels(values: Array) -> Array:
+        return np.einsum("nk,nkc->nc", weight[on], values[corners])
+
+    x, y = (at_texels(surface.vertices) - CENTRE).T[:2]
+    smooth = at_texels(surface.diffuse)
+    sharp = smooth * (1 + detail["diffuse_detail"].values[on])
+    total = np.hypot(
+        smooth * errors[on],
+        at_texels(fitted["diffuse_reflectance_total_error"].values),
+    )
+    true = patch.diffuse(x, y)
+    bent = at_texels(surface.normals)
+    moved = bent + detail["normal_detail"].values[on]
+    normal = patch.normals(x, y)
+    angles = [
+        np.degrees(np.arccos(np.clip(dots(unit(one), normal), -1, 1)))
+        for one in (bent, moved)
+    ]
+    spread = np.sqrt(
+        (detail["normal_detail_error"].values[on].astype(float) ** 2).sum(1)
+    )
+    own = at_texels(fitted["normal_total_error"].values[:, None])[:, 0]
+    allowed = 1.73 * np.hypot(np.degrees(spread), own)  # of an angle of two axes
+    rms = [np.sqrt(((one / true - 1) ** 2).mean()) for one in (smooth, sharp)]
+    print(
+        f"seed {seed}: R_d at texels, relative RMS error {rms[0]:.3f} by surfels, "
+        f"{rms[1]:.3f} with detail; normals, median {np.median(angles[0]):.2f} and "
+        f"{np.median(angles[1]):.2f} degrees; in the 95 % intervals with the total errors of "
+        f"the surfels {(np.abs(sharp - true) < 1.96 * total).mean():.3f} and "
+        f"{(angles[1] < allowed).mean():.3f}, with the detail's alone "
+        f"{(np.abs(sharp - true) < 1.96 * smooth * errors[on]).mean():.3f}"
+    )
+
+
 def main(
     *,
-    seeds: Annotated[int, "Number of patches."] = 2,
+    seeds: Annotated[int, "Number of patches."] = 3,
     lights: Annotated[int, "Number of lights."] = 24,
     cameras: Annotated[int, "Number of cameras."] = 4,
     side: Annotated[float, "Side of the patches [mm]."] = 44.0,
@@ -269,7 +317,9 @@ def main(
     for seed in range(seeds):
         with tempfile.TemporaryDirectory() as scratch:
             folder = Path(scratch) / "patch"
-            write_patch(folder, side=side, seed=seed, lights=lights, cameras=cameras)
+            patch = write_patch(
+                folder, side=side, seed=seed, lights=lights, cameras=cameras
+            )
             begin = time.perf_counter()
             with ingest_capture(read_capture(folder), scratch=scratch) as tree:
                 capture = tree.load()
@@ -278,6 +328,7 @@ def main(
             detail = compare_photographs(model, capture)
             keys = {f"{one.light} {one.camera}" for one in detail}
             peer = lambert_predictions(folder, capture, model, keys)
+            print_recovery(seed, patch, model)
             del model["detail"]
             surfels = compare_photographs(model, capture)
         for kind, pictures in (("surfels", surfels), ("detail", detail)):
