@@ -66,7 +66,7 @@ def pictures(surface, camera, lights, scene) -> None:
     cases = {
         "one light": (Lighting(lights.select([0])), Quality(64)),
         "dome": (complete, Quality(64)),
-        "dome, error 2 %": (complete, Quality(error=0.02)),
+        "dome, error 2 %": (complete, Quality(4096, 0.02)),
         "sky": (room, Quality(64)),
         "dome, subsurface": (complete, Quality(32, subsurface=True)),
     }

@@ -643,11 +643,12 @@ class RenderParameters(Limited):
         metavar="AZ,EL",
     )
     samples: int = option(
-        32, "Number of rays per pixel.", name="spp", minimum=8, maximum=4096
+        1024, "Largest number of rays per pixel.", name="spp", minimum=8, maximum=4096
     )
-    error: float | None = option(
-        None,
-        "Relative standard error of the picture at which sampling stops.",
+    error: float = option(
+        0.05,
+        "Relative standard error of radiance at which sampling stops; 0.05 is 2 % of "
+        "displayed values.",
         minimum=1e-4,
         maximum=1,
     )
@@ -667,6 +668,12 @@ class RenderParameters(Limited):
         maximum=1e9,
     )
     subsurface: bool = option(False, "Simulate subsurface transport by the dipole.")
+    bounces: int = option(
+        0,
+        "Diffuse bounces of light between parts of the face; 1 if the fit subtracted it.",
+        minimum=0,
+        maximum=1,
+    )
 
 
 @dataclass(frozen=True)

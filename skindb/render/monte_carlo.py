@@ -22,9 +22,16 @@ from skindb.render.shading import (
     points_on_discs,
     seen_points,
     trace_view,
-    transmitted_irradiance,
 )
-from skindb.render.subsurface import FAR, Image, RunningMean, subsurface_light
+from skindb.render.subsurface import (
+    FAR,
+    MIN_PASSES,
+    SAMPLES_PER_PASS,
+    Image,
+    RunningMean,
+    received_irradiance,
+    subsurface_light,
+)
 from skindb.types import Array, Index, Mask, Progress, dots, float64, lengths
 
 # rays per pixel and axis in one batch; random numbers are stratified over the rays of a
@@ -33,8 +40,6 @@ RAYS_PER_AXIS = 2
 RAYS_PER_AXIS_ENVIRONMENT = 4
 # for an estimate of the variance that can be compared with the target error
 MIN_BATCHES = 8
-# rays per pixel at which rendering ends even if the target error is not reached
-MAX_SAMPLES = 4096
 LIGHTS_PER_RAY = 4  # lights drawn for each ray; with fewer lights, all are used
 CELLS = 16  # of normals along each axis
 # in probabilities, because normals of a cell differ by up to 0.1, and for the discs of
@@ -47,8 +52,8 @@ class Quality:
     """Number of rays of a picture, and the light that it includes.
 
     `samples` is the number of rays per pixel, at least eight. With `error`, rendering
-    ends as soon as the relative standard error (root of the mean variance over the root
-    mean square of the visible surface) is at most this value, or at MAX_SAMPLES.
+    ends earlier, as soon as the relative standard error (root of the mean variance over
+    the root mean square of the visible surface) is at most this value.
     `tolerance` is the opening of the octree for subsurface light.
     """
 
@@ -86,8 +91,7 @@ def render_monte_carlo(
 ) -> Rendering:
     """Render a surface as the mean of independent batches of rays.
 
-    Light that parts of the face send to each other is added for the lights alone, and if
-    the surface asks for it.
+    Light that parts of the face send to each other is added if the surface asks for it.
 
     Parameters
     ----------
@@ -112,7 +116,7 @@ def render_monte_carlo(
     """
     rays = RayScene(surface.vertices, surface.faces) if scene is None else scene
     sums = RunningMean()
-    painter = _Painter.of(surface, rays, lighting, quality)
+    painter = _Painter.of(surface, rays, lighting, quality, rng)
     if quality.subsurface and "diffuse" in quality.terms:
         view = trace_view(
             surface, camera, samples=RAYS_PER_AXIS, scene=rays, pixels=pixels
@@ -125,8 +129,6 @@ def render_monte_carlo(
     per_batch = axis**2
     # at least two batches, for the variance
     limit = max(quality.samples, 2 * per_batch)
-    if quality.error is not None:
-        limit = MAX_SAMPLES
     while sums.count * per_batch < limit and (
         quality.error is None
         or sums.count < MIN_BATCHES
@@ -159,13 +161,17 @@ class _Painter:
     lobes: TableSampler
     weights: Array  # (v, k) of the lobes
     choice: LightChoice | None  # None without lights
-    # (v, 3) under the boundary, which is interpolated: subsurface light, and `bounced_exitance`
-    # by the lights, from their centres, as shadows of discs do not matter for it
+    # (v, 3) under the boundary, which is interpolated: subsurface light and `bounced_exitance`
     exitance: Array | None
 
     @classmethod
     def of(
-        cls, surface: Surface, scene: RayScene, lighting: Lighting, quality: Quality
+        cls,
+        surface: Surface,
+        scene: RayScene,
+        lighting: Lighting,
+        quality: Quality,
+        rng: np.random.Generator,
     ) -> _Painter:
         lights = lighting.lights
         choice = None
@@ -173,10 +179,16 @@ class _Painter:
             middle = surface.vertices.mean(axis=0)
             choice = LightChoice.of_lights(lights, middle)
         bounced = None
-        diffuse = "diffuse" in quality.terms
-        if lights is not None and surface.inter_reflection and diffuse:
-            received = transmitted_irradiance(surface, lights, scene)
-            bounced = bounced_exitance(surface, received @ lights.intensity)
+        if surface.inter_reflection and "diffuse" in quality.terms:
+            received = received_irradiance(
+                surface.vertices,
+                surface.normals,
+                lighting,
+                scene,
+                eta=surface.eta,
+                rng=rng,
+            )
+            bounced = bounced_exitance(surface, received)
         tables, weights = surface.model.resample(surface.parameters)
         lobes = TableSampler.of_tables(tables)
         return cls(surface, scene, lighting, quality, lobes, weights, choice, bounced)
@@ -188,13 +200,17 @@ class _Painter:
         (h, w, 3) that it adds to the picture.
         """
         error = self.quality.error
+        count = MIN_PASSES
+        if error is None:
+            count = max(count, self.quality.samples // SAMPLES_PER_PASS)
         light, spread = subsurface_light(
             self.surface,
             self.lighting,
             self.scene,
             view.shown(len(self.surface.vertices)),
             tolerance=self.quality.tolerance,
-            error=None if error is None else error / 2,
+            count=count,
+            error=np.inf if error is None else error / 2,
             rng=rng,
         )
         if self.exitance is not None:

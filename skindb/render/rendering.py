@@ -5,7 +5,7 @@ without noise from the lights of its dome.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -189,6 +189,7 @@ def render(
     samples: int = 64,
     error: float | None = None,
     subsurface: bool = False,
+    bounces: int = 0,
     terms: Sequence[str] = ("diffuse", "surface"),
     scale: float = 1.0,
     seed: int = 0,
@@ -211,12 +212,14 @@ def render(
         Name of a camera of the dome, or any other camera; default the most frontal
         camera of the dome.
     samples
-        Number of rays per pixel.
+        Number of rays per pixel, or the largest one with `error`.
     error
-        Target relative standard error of the picture. If given, it determines the
-        number of rays, at most 4,096 per pixel, and `samples` is not used.
+        Target relative standard error of the picture, at which sampling stops.
     subsurface
         Whether diffuse light travels through the skin (dipole); requires translucency in the model.
+    bounces
+        Number of diffuse bounces of light between parts of the face, 0 or 1. Models whose
+        fits subtracted such light always have one.
     terms
         Terms of the BRDF to include: "diffuse", "surface" or both.
     scale
@@ -248,6 +251,7 @@ def render(
         environment,
         camera,
         subsurface=subsurface,
+        bounces=bounces,
         scale=scale,
         error=error,
     )
@@ -293,6 +297,7 @@ def render_inputs(
     camera: str | Camera | None,
     *,
     subsurface: bool,
+    bounces: int = 0,
     scale: float,
     error: float | None = None,
 ) -> RenderInputs:
@@ -307,6 +312,8 @@ def render_inputs(
     else:
         seen_by, names["camera"] = chosen_camera(dome, camera)
     surface = from_model(model)
+    if bounces:
+        surface = replace(surface, inter_reflection=True)
     if subsurface:
         require_translucency(surface)
     sized = seen_by.scaled(scale)
@@ -362,7 +369,7 @@ def render_picture(
         Only plan the picture and write nothing.
     **options
         Of `skindb.parameters.RenderParameters`: lights, environment, camera, samples,
-        error, seed and subsurface as in `render`; view and light_from, a camera and a
+        error, seed, subsurface and bounces as in `render`; view and light_from, a camera and a
         light beside the dome; size, the width in pixels; alpha, whether the background is
         transparent; and exposure, a factor on the radiance. The exposure "fixed" shows a
         white matte surface, which stands in the place of the face and faces the camera (the
@@ -398,7 +405,7 @@ def render_picture(
         )
         skipped = [str(omission) for omission in inputs.plan.omissions]
         return {"path": str(out), **inputs.names, "skipped": skipped, "kept": KEPT}
-    names = ("samples", "error", "subsurface", "seed")
+    names = ("samples", "error", "subsurface", "bounces", "seed")
     settings = {name: getattr(parameters, name) for name in names}
     frames = [render(model, **shot, **settings) for shot in shots]
     seen = frames[0]

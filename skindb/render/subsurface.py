@@ -37,6 +37,7 @@ MIN_PASSES = (
     8  # for an estimate of the variance that can be compared with a target error
 )
 MAX_PASSES = 64
+SAMPLES_PER_PASS = 16  # rays per pixel for each pass of pictures without a target error
 # relative to the light at its corners: of the change over a triangle, above which it is
 # divided. Linear interpolation is then wrong by an eighth of it at most
 MAX_CHANGE = 0.1
@@ -84,20 +85,20 @@ def subsurface_light(
     receivers: Mask,
     *,
     tolerance: float,
-    error: float | None,
+    count: int,
+    error: float = np.inf,
     rng: np.random.Generator,
 ) -> tuple[Array, Array]:
     """Radiant exitance (v, 3) under the boundary and its standard error, as the mean of
     independent passes; vertices that are no receivers (v,) have that of the nearest one.
 
     Each pass has other points of the surface, which receive light, so that the edges of
-    shadows do not follow the triangles. With `error`, passes end at this relative error.
+    shadows do not follow the triangles. There are `count` of them, and up to MAX_PASSES until
+    this relative error.
     """
     passes = RunningMean()
-    while passes.count < MIN_PASSES or (
-        error is not None
-        and passes.count < MAX_PASSES
-        and passes.relative_error() > error
+    while passes.count < count or (
+        passes.count < MAX_PASSES and passes.relative_error() > error
     ):
         light = _light_of_pass(surface, lighting, scene, receivers, tolerance, rng)
         passes.add(light, receivers.astype(float))

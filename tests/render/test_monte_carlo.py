@@ -245,7 +245,7 @@ def test_render__ends_at_the_wanted_error_and_says_so() -> None:
         ball(),
         camera(),
         SKY,
-        Quality(error=0.05),
+        Quality(samples=1024, error=0.05),
         rng=np.random.default_rng(1),
         progress=lambda *a: calls.append(a),
     )

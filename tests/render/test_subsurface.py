@@ -114,7 +114,7 @@ def test_subsurface_light__at_a_shadow_and_at_a_bright_spot_is_the_sum() -> None
         scene,
         flat,
         tolerance=0.1,
-        error=None,
+        count=8,
         rng=np.random.default_rng(0),
     )
     for low, high in ((-4.0, 4.0), (-14.0, -6.0)):
