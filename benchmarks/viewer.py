@@ -1,4 +1,4 @@
-"""Frames per second of the viewer in headless Chromium with software rendering, and the
+"""Time of the gestures of the viewer in headless Chromium with software rendering, and the
 size of a page.
 
 python -m benchmarks viewer PAGE.html
@@ -12,62 +12,65 @@ from pathlib import Path
 from playwright.sync_api import sync_playwright
 
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-FRAMES = 20
-MEASURE = """async ([lights, glow, amount, still]) => {
-    const canvas = document.getElementById('canvas'), gl = skindb.painter().gl;
-    const pixel = new Uint8Array(4);
-    while (skindb.state.lights.length < lights) document.getElementById('more').click();
-    skindb.state.glow = glow;
-    skindb.amounts(skindb.amounts().map(() => amount));
-    skindb.state.azimuth = 0;
-    // the face turns to and fro, so that all cases show it from the front
-    const frame = async (i) => {
-        if (still) { skindb.state.azimuth = i % 2 ? 5 : 0; skindb.stop(); skindb.draw(); }
-        else {
-            const key = i % 2 ? 'ArrowRight' : 'ArrowLeft';
-            canvas.dispatchEvent(new KeyboardEvent('keydown', {key}));
-            await new Promise(requestAnimationFrame);
-        }
-        gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);  // waits for the frame
+ROUNDS = 15
+# frames of the gestures take turns, so that other load slows all of them down alike
+MEASURE = """async () => {
+    const {state, painter} = skindb, {gl, canvas, face} = painter();
+    const pixel = new Uint8Array(4), times = {};
+    const gestures = {
+        turn: (i) => { state.azimuth = i % 2 ? 5 : 0; },
+        light: (i) => { state.lights[0].azimuth = i % 2 ? -20 : -15; },
+        environment: (i) => { state.around.turn = i % 2 ? 5 : 0; },
     };
-    await frame(0);
-    const start = performance.now();
-    for (let i = 0; i < FRAMES; i++) await frame(i);
-    return 1000 * FRAMES / (performance.now() - start);
-}""".replace("FRAMES", str(FRAMES))
-CASES = (  # lights, subsurface scattering, amount of the traits, whether at rest
-    (1, False, 0, True),
-    (1, False, 0, False),
-    (1, True, 0, False),
-    (1, True, 1, True),
-    (1, True, 1, False),
-    (2, True, 1, False),
-    (4, True, 1, False),
-)
+    face.traits.forEach((trait, k) => {
+        gestures[`slider of ${trait.name}`] = (i) => {
+            skindb.amounts(face.traits.map((_, j) => (j === k ? 0.5 + i / 100 : 0)));
+        };
+    });
+    skindb.stop();
+    const drawn = (change, i, coarse) => {
+        const start = performance.now();
+        change(i);
+        painter().draw(state, coarse);
+        gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);  // waits for the frame
+        return performance.now() - start;
+    };
+    for (const fraction of [0.5, 1]) {
+        canvas.width = 800 * fraction;
+        canvas.height = 600 * fraction;
+        for (let i = 0; i <= ROUNDS; i++)
+            for (const [name, change] of Object.entries(gestures)) {
+                skindb.amounts(face.traits.map(() => 0));
+                drawn(() => {}, 0, fraction < 1);  // without the sliders
+                const took = drawn(change, i, fraction < 1);
+                if (i) (times[`${name} ${fraction}`] ||= []).push(took);
+            }
+    }
+    return times;
+}""".replace("ROUNDS", str(ROUNDS))
 
 
 def main(page: Path) -> None:
-    """Print the frame rate for each number of lights."""
-    page_file = page
-    print(f"{page_file.stat().st_size / 1e6:.1f} MB")
+    """Print the median time of a frame of each gesture, and its ratio to that of a turn."""
+    print(f"{page.stat().st_size / 1e6:.1f} MB")
     with sync_playwright() as running:
         browser = running.chromium.launch(
             executable_path=shutil.which("chromium"), args=FLAGS
         )
-        page = browser.new_page(viewport={"width": 1120, "height": 600})
-        page.goto(page_file.resolve().as_uri())
-        page.evaluate("skindb.ready")
-        size = page.evaluate(
-            "[skindb.painter().canvas.clientWidth, skindb.painter().canvas.clientHeight]"
+        tab = browser.new_page(
+            viewport={"width": 1120, "height": 600}, reduced_motion="reduce"
         )
-        print(f"canvas of {size[0]} x {size[1]} pixels")
-        for lights, glow, amount, still in CASES:
-            rate = page.evaluate(MEASURE, [lights, glow, amount, still])
-            parts = [
-                f"lights: {lights}",
-                f"subsurface scattering {'on' if glow else 'off'}",
-                f"traits at {amount}",
-            ]
-            parts.append("full resolution" if still else "while the view turns")
-            print(f"{', '.join(parts)}: {rate:.1f} frames per second")
+        tab.set_default_timeout(0)
+        tab.goto(page.resolve().as_uri())
+        tab.evaluate("skindb.ready")
+        times = tab.evaluate(MEASURE)
         browser.close()
+    for name, samples in times.items():
+        gesture, _, fraction = name.rpartition(" ")
+        size = "800 x 600" if fraction == "1" else "400 x 300 (while moving)"
+        median = sorted(samples)[ROUNDS // 2]
+        turn = sorted(times[f"turn {fraction}"])[ROUNDS // 2]
+        print(
+            f"{size}, {gesture}: {median:.0f} ms, {1000 / median:.1f} frames per second, "
+            f"{median / turn:.1f} turns"
+        )

@@ -740,8 +740,8 @@ class ViewParameters(Limited):
     )
     environment: Path | None = option(
         None,
-        "Latitude-longitude image of light from all directions (.exr).  [default: "
-        "overcast sky]",
+        "Environment: latitude-longitude image of light from all directions (.exr).  "
+        "[default: overcast sky]",
     )
     dictionary: Path | None = option(None, DICTIONARY_HELP)
 

@@ -26,9 +26,10 @@ def started_browser():
         browser.close()
 
 
-def opened(browser, address, *, width=620, height=320):
+def opened(browser, address, *, width=620, height=320, motion="reduce"):
     """A page of skindb that is ready; `problems` collects its errors."""
-    page = browser.new_page(viewport={"width": width, "height": height})
+    size = {"width": width, "height": height}
+    page = browser.new_page(viewport=size, reduced_motion=motion)
     page.set_default_timeout(1000 * PATIENCE_SECONDS)
     page.problems = []
     page.on(

@@ -290,6 +290,8 @@ def view(
     printed address opens it, once, in one browser of this machine, until Ctrl-C ends
     the server.
     """
+    if out is not None:
+        writable(out, ".html")
     amounts = trait_amounts(parameters.traits, default=1.0)
     require(
         0.0 not in amounts.values(),
@@ -314,6 +316,5 @@ def view(
         server = workflow.view_server(database, chosen, port=port, **options)
         serve(server, takes=chosen)
         return
-    writable(out, ".html")
     report = workflow.view_takes(database, chosen, out, **options)
     emit(report, [report["path"]])

@@ -29,6 +29,7 @@ SCRIPTS = (
     "page/shaders",
     "page/gpu",
     "page/visible",
+    "page/sky",
     "page/painter",
     "page/main",
 )
@@ -36,13 +37,13 @@ MAX_PAGE_BYTES = 30_000_000
 OVERCAST = "overcast sky"
 APPROXIMATIONS = (
     "Shadows come from maps of 1,024 texels with filtered edges. Light under the "
-    "skin is the irradiance, blurred in "
-    "the texture by one Gaussian, which has the mean square distance of the dipole "
-    "and the local diffusion length. "
-    "Light from all directions is that of 256 distant lights, four of which are "
-    "added in each step. Light that is "
-    "reflected more than once is not included. skindb render omits it too, but has "
-    "none of the other approximations."
+    "skin is the irradiance, blurred in the texture by one Gaussian, which has the mean "
+    "square distance of the dipole and the local diffusion length. Diffuse light of the "
+    "environment comes from spherical harmonics of the order 3 at each surfel, its "
+    "reflection by the surface from 256 distant lights, and from a smooth image while "
+    "something moves. Without a graphics card, fewer pixels and texels are used until "
+    "the picture rests. Light that is reflected more than once is not included. skindb "
+    "render omits it too, but has none of the other approximations."
 )
 LOCAL = "127.0.0.1"
 # another port is that of a tunnel
@@ -118,10 +119,10 @@ class PagedFace:
 
 
 def index_text(
-    faces: Sequence[PagedFace], *, embedded: bool = False, surroundings: str = OVERCAST
+    faces: Sequence[PagedFace], *, embedded: bool = False, environment: str = OVERCAST
 ) -> str:
     """The page of faces, which contains their data or requests faces/<take>.json;
-    `surroundings` names the environment.
+    `environment` is the name of the light from all directions.
     """
     takes = [
         {"take": face.take, "title": face.title, "still": face.still} for face in faces
@@ -135,7 +136,7 @@ def index_text(
     parts = {
         "title": html.escape(title),
         "approximations": APPROXIMATIONS,
-        "surroundings": html.escape(surroundings),
+        "environment": html.escape(environment),
         "takes": embedded_json(takes),
         "faces": "\n".join(scripts) if embedded else "",
     }
@@ -143,7 +144,7 @@ def index_text(
 
 
 def write_page(
-    out: Path, faces: Iterable[PagedFace], *, surroundings: str = OVERCAST
+    out: Path, faces: Iterable[PagedFace], *, environment: str = OVERCAST
 ) -> int:
     """Write a self-contained page of faces and return its size in bytes.
 
@@ -152,7 +153,7 @@ def write_page(
     InputError
         If the page would be larger than 30 MB.
     """
-    content = index_text([*faces], embedded=True, surroundings=surroundings).encode()
+    content = index_text([*faces], embedded=True, environment=environment).encode()
     require(
         len(content) <= MAX_PAGE_BYTES,
         str(out),

@@ -340,7 +340,7 @@ def view_takes(
     """
     named = OVERCAST if environment is None else environment.name
     faces = _faces(db, takes, environment=environment, progress=progress, **options)
-    size = write_page(out, (PagedFace.of(*face) for face in faces), surroundings=named)
+    size = write_page(out, (PagedFace.of(*face) for face in faces), environment=named)
     return {"path": str(out), "takes": list(takes), "bytes": size}
 
 
@@ -383,7 +383,7 @@ def view_server(
     def index() -> bytes:
         permitted = [_permitted(db, faces, take) for take in takes]
         return index_text(
-            [face for face in permitted if face is not None], surroundings=named
+            [face for face in permitted if face is not None], environment=named
         ).encode()
 
     def data(take: str) -> bytes:

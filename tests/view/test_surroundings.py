@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from skindb.render.scene import Environment
+from skindb.optics.fresnel import fresnel_transmittance
+from skindb.render.scene import Environment, Surface
 from skindb.view.face import distant_lights, overcast_sky
+from skindb.view.transfer import even_directions, harmonics, sky_transfer
 
 
 def irradiance(environment, normal):
@@ -86,3 +89,34 @@ def test_distant_lights__of_a_sun_that_outshines_a_large_sky():
     np.testing.assert_allclose(
         of_lights(lights, normal), irradiance(environment, normal), rtol=0.1
     )
+
+
+def test_harmonics__are_orthonormal():
+    basis = harmonics(even_directions(4000))
+    gram = 4 * np.pi / 4000 * basis.T @ basis
+    # of the lattice: 1e-3 for polynomials of the degree 6
+    np.testing.assert_allclose(gram, np.eye(16), atol=5e-3)
+
+
+def test_sky_transfer__of_a_white_sky_is_the_visible_transmitted_cosine():
+    """On a plane below a wall, against the integral over the visible quarter of the sky."""
+    ground = [[-50, -50, 0], [50, -50, 0], [50, 0, 0], [-50, 0, 0]]
+    wall = [[-9e4, 1, -1], [9e4, 1, -1], [9e4, 1, 9e4], [-9e4, 1, 9e4]]
+    point = [0, 0, 0]
+    surface = Surface(
+        np.array([*ground, *wall, point], float),
+        np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]),
+        np.tile([0.0, 0, 1], (9, 1)),
+        np.ones((9, 3)),
+        np.zeros((9, 0)),
+        model=None,
+    )
+    transfer = sky_transfer(surface, 4096)[8]
+    cosine = (np.arange(1000) + 0.5) / 1000
+    hemisphere = 2 * np.pi * np.mean(cosine * fresnel_transmittance(cosine, 1.3))
+    half = hemisphere / 2 * harmonics(np.eye(3))[0, 0]
+    assert transfer[0] == pytest.approx(half, rel=0.02)  # of 1,024 rays
+    # the sky is seen at -y; 256 rays are what a page has
+    assert transfer[2] < -0.5 * half
+    few = sky_transfer(surface, 256)[8]
+    np.testing.assert_allclose(few, transfer, atol=0.05 * half)

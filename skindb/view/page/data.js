@@ -36,17 +36,17 @@ async function readFace(record) {
   return face;
 }
 
-// values of a face edited along traits: albedo and diffusion length change exponentially, the others linearly
+// Values of a face edited along traits: albedo and diffusion length change exponentially, the others linearly. Arrays
+// that no trait changes are those of the face.
 function editedValues(face, amounts) {
-  const out = Object.fromEntries(VALUES.map((name) => [name, Float32Array.from(face[name])]));
-  face.traits.forEach((trait, at) => {
-    const amount = amounts[at];
-    if (!amount) return;
-    for (const name of ["position", "normal", "weightA", "weightB"])
-      for (let i = 0; i < out[name].length; i++) out[name][i] += amount * trait[name][i];
-    for (const name of ["albedo", "diffusion"])
-      for (let i = 0; i < out[name].length; i++) out[name][i] *= Math.exp(amount * trait[name][i]);
-  });
-  for (const name of ["weightA", "weightB"]) for (let i = 0; i < out[name].length; i++) out[name][i] = Math.max(out[name][i], 0);
-  return out;
+  const values = {};
+  for (const name of VALUES) {
+    const moves = face.traits.map((trait, at) => [trait[name], amounts[at]]).filter(([move, amount]) => move && amount);
+    const out = (values[name] = moves.length ? Float32Array.from(face[name]) : face[name]);
+    const isRatio = name === "albedo" || name === "diffusion", isWeight = name.startsWith("weight");
+    for (const [move, amount] of moves)
+      for (let i = 0; i < out.length; i++) out[i] = isRatio ? out[i] * Math.exp(amount * move[i]) : out[i] + amount * move[i];
+    if (isWeight && moves.length) for (let i = 0; i < out.length; i++) out[i] = Math.max(out[i], 0);
+  }
+  return values;
 }

@@ -53,13 +53,18 @@ function table3d(gl, [depth, height, width], halves) {
   return texture;
 }
 
-function target(gl, size) {
+function halfTexture(gl, width, height, type, values) {
   const texture = gl.createTexture();
   gl.bindTexture(gl.TEXTURE_2D, texture);
-  gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, size, size, 0, gl.RGBA, gl.HALF_FLOAT, null);
+  gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, width, height, 0, gl.RGBA, type, values);
   for (const axis of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, axis, gl.CLAMP_TO_EDGE);
   gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
   gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.LINEAR);
+  return texture;
+}
+
+function target(gl, size) {
+  const texture = halfTexture(gl, size, size, gl.HALF_FLOAT, null);
   const frame = gl.createFramebuffer();
   gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
   gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
@@ -91,11 +96,16 @@ function shadowTarget(gl, size, layers) {
   return { texture, frame: gl.createFramebuffer(), size };
 }
 
+function attribute(gl, location, size, type, values) {
+  gl.bindBuffer(gl.ARRAY_BUFFER, values);
+  gl.enableVertexAttribArray(location);
+  gl.vertexAttribPointer(location, size, type, false, 0, 0);
+}
+
 function buffer(gl, location, size, type, values) {
   const made = gl.createBuffer();
   gl.bindBuffer(gl.ARRAY_BUFFER, made);
   gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
-  gl.enableVertexAttribArray(location);
-  gl.vertexAttribPointer(location, size, type, false, 0, 0);
+  attribute(gl, location, size, type, made);
   return made;
 }

@@ -10,42 +10,71 @@ const COMPONENTS = {
   "error of the albedo": "Relative standard error including that of the model, from 0 (blue) to 30 % (yellow).",
   albedo: "Diffuse reflectance, without lighting.",
 };
+const BACKGROUNDS = { studio: null, black: [0, 0, 0], grey: [0.47, 0.47, 0.47], white: [1, 1, 1] };  // studio is that of the style
+const PRESETS = [[-18, 38, 0.85], [150, 25, 1.2], [-60, 10, 0.5], [-20, 70, 0.5]];  // azimuth, elevation and power of a key, a rim and other lights
 const REST_MS = 300;  // a movement has ended after this time without another change
+const SLOW_MS = 66, FAST_MS = 25;  // between frames, beyond which fewer or more pixels are drawn while something moves
+const TURN = { angle: 30, seconds: 16 };
 const state = {
-  azimuth: 0, elevation: 0, distance: 700, tangent: 0.2, exposure: 1, softness: 1.5, divider: 1, component: 0,
-  withDiffuse: true, withSurface: true, glow: true, background: [0.07, 0.07, 0.08], lights: [], surroundings: [],
+  azimuth: TURN.angle, elevation: 4, distance: 700, tangent: 0.2, exposure: 1, softness: 1.5, divider: 1, component: 0, toned: true,
+  withDiffuse: true, withSurface: true, glow: true, background: BACKGROUNDS.studio, lights: [], around: { on: true, turn: 0, power: 0.35 },
 };
-const around = { on: false, turn: 0, power: 1 };  // light from all directions
-let painter = null, face = null, amounts = [], active = 0, pending = false, moving = null;
+let painter = null, face = null, amounts = [], active = 0, pending = false, moving = null, turning = null;
+const speed = { fraction: 1, last: 0 };  // of the pixels along a side, while something moves
 
 function say(text) { $("status").textContent = text; }
 
 function redraw() {
   if (pending || !painter) return;
   pending = true;
-  requestAnimationFrame(() => {
+  requestAnimationFrame((now) => {
     pending = false;
+    adapt(now);
     resize();
-    if (painter.draw(state) < 1) redraw();
+    if (painter.draw(state, moving !== null) < 1) redraw();
   });
 }
 
-// For drawing while something moves. Without a graphics card a quarter of the pixels is drawn until it stops.
+// Draws fewer pixels while something moves if frames take too long, and at once without a graphics card.
+function adapt(now) {
+  const since = now - speed.last, most = painter.software ? 0.5 : 1;
+  speed.last = moving === null ? 0 : now;
+  if (moving === null || since > REST_MS) speed.fraction = Math.min(speed.fraction, most);
+  else if (since > SLOW_MS) speed.fraction = Math.max(0.8 * speed.fraction, 0.25);
+  else if (since < FAST_MS) speed.fraction = Math.min(1.1 * speed.fraction, most);
+}
+
+// for drawing while something moves
 function redrawMoving() {
-  if (painter && painter.software) {
-    clearTimeout(moving);
-    moving = setTimeout(() => { moving = null; redraw(); }, REST_MS);
-  }
+  clearTimeout(moving);
+  moving = setTimeout(() => { moving = null; redraw(); }, REST_MS);
   redraw();
 }
 
 function resize() {
-  const canvas = $("canvas"), ratio = Math.min(window.devicePixelRatio || 1, 2) * (moving === null ? 1 : 0.5);
+  const canvas = $("canvas"), ratio = Math.min(window.devicePixelRatio || 1, 2) * (moving === null ? 1 : speed.fraction);
   const width = Math.max(Math.round(canvas.clientWidth * ratio), 1), height = Math.max(Math.round(canvas.clientHeight * ratio), 1);
   if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
 }
 
+// Turns the face to the other side and back, until something is touched.
+function turnSlowly(start) {
+  turning = requestAnimationFrame((now) => {
+    const part = (now - start) / (1000 * TURN.seconds);
+    state.azimuth = TURN.angle * Math.cos(2 * Math.PI * Math.min(part, 1));
+    redrawMoving();
+    if (part < 1) turnSlowly(start);
+    else turning = null;
+  });
+}
+
+function stopTurning() {
+  if (turning !== null) cancelAnimationFrame(turning);
+  turning = null;
+}
+
 function stop() {
+  stopTurning();
   clearTimeout(moving);
   moving = null;
   resize();
@@ -64,26 +93,8 @@ function slider(parent, label, { min, max, step, value, unit = "" }, change) {
 }
 
 function newLight() {
-  const presets = [[35, 30], [-60, 10], [180, 40], [-20, 70]];
-  const [azimuth, elevation] = presets[state.lights.length % presets.length];
-  return { azimuth, elevation, distance: face.lightDistance, intensity: face.lightIntensity, power: 1 };
-}
-
-// lights of the surroundings in the form that the painter expects: far away, rotated about the vertical
-function surroundings() {
-  if (!around.on) return [];
-  const far = 100 * face.radius, turn = (around.turn * Math.PI) / 180, found = face.surroundings;
-  const total = found.irradiance.reduce((sum, one) => sum + one[1], 0);
-  return found.direction.map(([x, y, z], i) => {
-    const towards = [Math.cos(turn) * x + Math.sin(turn) * z, y, Math.cos(turn) * z - Math.sin(turn) * x];
-    const intensity = found.irradiance[i].map((e) => e * far * far);
-    return { position: add(face.centre, towards, far), intensity, power: around.power, weight: (around.power * found.irradiance[i][1]) / total };
-  });
-}
-
-function showSurroundings() {
-  state.surroundings = surroundings();
-  redraw();
+  const [azimuth, elevation, power] = PRESETS[state.lights.length % PRESETS.length];
+  return { azimuth, elevation, distance: face.lightDistance, intensity: face.lightIntensity, power };
 }
 
 function showLights() {
@@ -101,20 +112,32 @@ function showLights() {
     group.addEventListener("focusin", () => { active = i; });
     list.append(group);
   });
-  $("fewer").disabled = state.lights.length < (around.on ? 1 : 2);
+  $("fewer").disabled = state.lights.length < (state.around.on ? 1 : 2);
   $("more").disabled = state.lights.length >= MAX_LIGHTS;
 }
 
+// the line is hidden where both sides are the same
 function showDivider() {
   const cut = $("cut");
-  cut.hidden = !face.traits.length || state.divider <= 0 || state.divider >= 1;
+  cut.hidden = !amounts.some(Boolean) || state.divider <= 0 || state.divider >= 1;
   cut.style.left = `${100 * state.divider}%`;
 }
 
 function applyTraits() {
   if (!face.traits.length) return;
-  painter.update("edited", editedValues(face, amounts), amounts.some(Boolean));
+  painter.update(editedValues(face, amounts), amounts.some(Boolean));
+  showDivider();
 }
+
+// what the interpolation of an edit changes, and its error
+function traitNote({ amount, errors }) {
+  const names = { position: ["shape", (x) => `${x.toFixed(2)} mm`], albedo: ["albedo", percent], diffusion: ["diffusion length", percent] };
+  const stated = Object.entries(names).filter(([name]) => name in errors).map(([name, [label, text]]) => `${label} ${text(errors[name])}`);
+  if (!stated.length) return "Gloss is interpolated linearly.";
+  return `Interpolated between 0 and ${amount}; median errors at ${amount / 2}: ${stated.join(", ")}.`;
+}
+
+function percent(x) { return `${(100 * x).toFixed(1)} %`; }
 
 function showTraits() {
   const box = $("traits");
@@ -126,12 +149,29 @@ function showTraits() {
     slider(box, trait.name, range, (x) => { amounts[i] = x / full; applyTraits(); });
     const note = document.createElement("p");
     note.className = "note";
-    note.textContent = `The albedo is interpolated between 0 and ${full}; at ${full / 2} its median error is ${(100 * trait.error).toFixed(1)} % of the albedo.`;
+    note.textContent = traitNote(trait);
     box.append(note);
   });
   state.divider = face.traits.length ? 0.5 : 1;
   $("divider").value = state.divider;
   showDivider();
+}
+
+// the meaning of the colours of a component
+function showLegend() {
+  const name = Object.keys(COMPONENTS)[state.component];
+  $("legend").textContent = COMPONENTS[name] + (name === "translucency" ? translucencyNote() : "");
+}
+
+// says if a map has one colour
+function translucencyNote() {
+  if (!face.translucent) return " The model of this face has no translucency.";
+  const ranges = [0, 1, 2].map((c) => {
+    const values = face.diffusion.filter((_, i) => i % 3 === c);
+    return [values.reduce((a, b) => Math.min(a, b)), values.reduce((a, b) => Math.max(a, b))];
+  });
+  if (ranges.some(([least, most]) => most - least > 0.01 * most)) return "";
+  return ` One value was measured for the whole face: ${ranges.map(([, most]) => most.toFixed(2)).join(", ")} mm.`;
 }
 
 function showAbout() {
@@ -151,12 +191,12 @@ function load(record) {
     painter.load(face);
     state.distance = face.radius * 6;
     state.tangent = 1.02 / 6;
-    if (!state.lights.length && !around.on) state.lights = [newLight()];
-    state.surroundings = surroundings();
+    if (!state.lights.length) for (let i = 0; i < 2; i++) state.lights.push(newLight());
     showLights();
     showTraits();
     showAbout();
-    $("translucent").disabled = !face.translucent || !painter.glows;
+    showLegend();
+    $("translucent").disabled = !face.translucent || !painter.floats;
     if (!face.translucent) state.glow = $("translucent").checked = false;
     say(`${face.attributes.take}: ${(face.position.length / 3).toLocaleString()} surfels, ${(face.triangles.length / 3).toLocaleString()} triangles.`);
     redraw();
@@ -177,25 +217,23 @@ async function choose(name) {
 
 function listen() {
   const canvas = $("canvas"), pointers = new Map();
-  let span = 0;
+  let gesture = null;  // of two fingers
   canvas.addEventListener("pointerdown", (event) => {
     canvas.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, event);
+    gesture = pointers.size === 2 ? { kind: "", start: [...pointers.values()], ...fingers(pointers) } : null;
   });
   canvas.addEventListener("pointermove", (event) => {
     const last = pointers.get(event.pointerId);
     if (!last) return;
     const dx = event.clientX - last.clientX, dy = event.clientY - last.clientY;
     pointers.set(event.pointerId, event);
-    if (pointers.size === 2) {
-      const [a, b] = [...pointers.values()], now = Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY);
-      if (span) zoom(span / now);
-      span = now;
-    } else if (event.shiftKey || event.buttons === 2) turnLight(0.4 * dx, -0.4 * dy);
+    if (gesture) twoFingers(gesture, pointers);
+    else if (event.shiftKey || event.buttons === 2) turnLight(0.4 * dx, -0.4 * dy);
     else turnView(-0.4 * dx, 0.4 * dy);
   });
   for (const kind of ["pointerup", "pointercancel"])
-    canvas.addEventListener(kind, (event) => { pointers.delete(event.pointerId); span = 0; });
+    canvas.addEventListener(kind, (event) => { pointers.delete(event.pointerId); gesture = null; });
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   canvas.addEventListener("wheel", (event) => { event.preventDefault(); zoom(Math.exp(event.deltaY * 0.001)); }, { passive: false });
   canvas.addEventListener("keydown", (event) => {
@@ -211,13 +249,40 @@ function listen() {
   canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); say("The graphics context was lost and is being restored ..."); });
   canvas.addEventListener("webglcontextrestored", () => {
     painter.prepare();
-    painter.tableA = painter.tableB = null;
     painter.load(face);
     applyTraits();
     say("The graphics context was restored.");
     redraw();
   });
   window.addEventListener("resize", redraw);
+  for (const kind of ["pointerdown", "keydown", "wheel", "input"]) window.addEventListener(kind, stopTurning, { capture: true });
+  $("cut").addEventListener("pointerdown", (event) => event.target.setPointerCapture(event.pointerId));
+  $("cut").addEventListener("pointermove", (event) => {
+    if (!event.buttons) return;
+    const { left, width } = canvas.getBoundingClientRect();
+    $("divider").value = Math.min(Math.max((event.clientX - left) / width, 0.02), 0.98);
+    $("divider").dispatchEvent(new Event("input"));
+  });
+  $("sheet").addEventListener("click", (event) => {
+    const open = document.body.classList.toggle("closed");
+    event.currentTarget.setAttribute("aria-expanded", String(!open));
+    redraw();
+  });
+}
+
+function fingers(pointers) {
+  const [a, b] = [...pointers.values()];
+  return { span: Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY), x: (a.clientX + b.clientX) / 2, y: (a.clientY + b.clientY) / 2 };
+}
+
+// Two fingers move the light if they move in the same direction, and zoom otherwise.
+function twoFingers(gesture, pointers) {
+  const now = fingers(pointers), [a, b] = [...pointers.values()].map((one, i) => [one.clientX - gesture.start[i].clientX, one.clientY - gesture.start[i].clientY]);
+  if (gesture.kind === "zoom") zoom(gesture.span / Math.max(now.span, 1));
+  else if (gesture.kind === "light") turnLight(0.4 * (now.x - gesture.x), -0.4 * (now.y - gesture.y));
+  else if (Math.hypot(...a) + Math.hypot(...b) < 24) return;
+  else gesture.kind = dot(a, b) > 0 ? "light" : "zoom";
+  Object.assign(gesture, now);
 }
 
 function turnView(across, up) {
@@ -228,7 +293,7 @@ function turnView(across, up) {
 
 function turnLight(across, up) {
   const light = state.lights[active] || state.lights[0];
-  if (!light) return;  // only the surroundings shine
+  if (!light) return;  // only the environment shines
   light.azimuth = ((light.azimuth + across + 540) % 360) - 180;
   light.elevation = Math.min(Math.max(light.elevation + up, -89), 89);
   for (const name of ["azimuth", "elevation"]) {
@@ -246,19 +311,21 @@ function controls() {
   Object.keys(COMPONENTS).forEach((name, i) => $("component").append(new Option(name, i)));
   $("component").addEventListener("change", (event) => {
     state.component = Number(event.target.value);
-    $("legend").textContent = Object.values(COMPONENTS)[state.component];
+    showLegend();
     redraw();
   });
-  for (const [id, key] of [["diffuse", "withDiffuse"], ["surface", "withSurface"], ["translucent", "glow"]])
+  for (const [id, key] of [["diffuse", "withDiffuse"], ["surface", "withSurface"], ["translucent", "glow"], ["toned", "toned"]])
     $(id).addEventListener("change", (event) => { state[key] = event.target.checked; redraw(); });
+  Object.keys(BACKGROUNDS).forEach((name) => $("background").append(new Option(name)));
+  $("background").addEventListener("change", (event) => { state.background = BACKGROUNDS[event.target.value]; redraw(); });
   $("around").addEventListener("change", (event) => {
-    around.on = event.target.checked;
-    if (!around.on && !state.lights.length) state.lights = [newLight()];
+    state.around.on = event.target.checked;
+    if (!state.around.on && !state.lights.length) state.lights = [newLight()];
     showLights();
-    showSurroundings();
+    redraw();
   });
-  slider($("surroundings"), "rotation", { min: -180, max: 180, step: 5, value: 0, unit: "°" }, (x) => { around.turn = x; state.surroundings = surroundings(); });
-  slider($("surroundings"), "power of the surroundings", { min: 0, max: 3, step: 0.05, value: 1 }, (x) => { around.power = x; state.surroundings = surroundings(); });
+  slider($("environment"), "rotation", { min: -180, max: 180, step: 5, value: 0, unit: "°" }, (x) => { state.around.turn = x; });
+  slider($("environment"), "power of the environment", { min: 0, max: 3, step: 0.05, value: state.around.power }, (x) => { state.around.power = x; });
   slider($("camera"), "exposure", { min: 0.1, max: 4, step: 0.05, value: 1 }, (x) => { state.exposure = x; });
   slider($("camera"), "softness of shadows", { min: 0, max: 6, step: 0.5, value: 1.5 }, (x) => { state.softness = x; });
   $("divider").addEventListener("input", (event) => { state.divider = Number(event.target.value); showDivider(); redrawMoving(); });
@@ -296,8 +363,13 @@ async function start() {
   listen();
   controls();
   await wanted();
+  if (!matchMedia("(prefers-reduced-motion: reduce)").matches) turnSlowly(performance.now());
 }
 
 // for tests and external scripts
-window.skindb = { state, redraw, choose, draw: () => { while (painter.draw(state) < 1); }, around, showSurroundings, painter: () => painter, amounts: (values) => { if (values) { amounts = values; applyTraits(); redraw(); } return amounts; }, stop };
+window.skindb = {
+  state, redraw, choose, stop, painter: () => painter, isTurning: () => turning !== null,
+  draw: () => { while (painter.draw(state) < 1); },
+  amounts: (values) => { if (values) { amounts = values; applyTraits(); redraw(); } return amounts; },
+};
 window.skindb.ready = start();

@@ -1,18 +1,13 @@
 // Draws one face, or the original and the edited face side by side, into a canvas.
 "use strict";
 
-const SHADOW_SIZE = 1024, GLOW_SIZE = 384;
+const SHADOW_SIZE = 1024, GLOW_SIZE = 384, COARSE_GLOW_SIZE = 96, FACE_HEIGHT_OVER_WIDTH = 1.5;
 
 // lights in groups of at most the number that one pass can process
 function batches(lights) {
   const out = [];
   for (let i = 0; i < lights.length; i += MAX_LIGHTS) out.push(lights.slice(i, i + MAX_LIGHTS));
   return out;
-}
-
-// total power of a group of lights, in an arbitrary unit
-function power(lights) {
-  return lights.reduce((sum, light) => sum + (light.weight ?? light.power), 0);
 }
 
 class Painter {
@@ -31,20 +26,17 @@ class Painter {
     this.programs = Object.fromEntries(Object.keys(SHADERS).map((name) => [name, compile(gl, name)]));
     this.programs.faceOfMany = compile(gl, "face", "SECOND_TABLE");
     this.shadow = shadowTarget(gl, SHADOW_SIZE, MAX_LIGHTS);
-    this.glows = this.floats ? ["irradiance", "across", "radius"].map(() => target(gl, GLOW_SIZE)) : null;
+    this.glows = {};
     this.empty = gl.createVertexArray();
     this.sides = {};
-    this.blurred = {};
-    this.fresh = {};
-    this.sum = this.sums = null;
-    this.edits = 0;  // counts changes of the face by traits
+    this.sum = this.sums = this.tableA = this.tableB = this.lobes = this.mirror = null;
   }
 
   load(face) {
     const gl = this.gl, names = face.traits.length ? ["plain", "edited"] : ["plain"];
-    this.lit = this.shadowed = "";
-    this.differ = this.moved = false;
-    this.fresh = {};
+    this.shadowed = [];
+    this.differ = false;
+    this.sky = "";
     this.sum = null;
     for (const side of Object.values(this.sides)) {
       gl.deleteVertexArray(side.vao);
@@ -52,10 +44,12 @@ class Painter {
     }
     this.face = face;
     this.visible = new VisibleTriangles(face);
+    for (const name of ["tableA", "tableB", "lobes"]) if (this[name]) gl.deleteTexture(this[name]);
+    this.ambient = buffer(gl, 9, 4, gl.FLOAT, new Float32Array((4 * face.position.length) / 3));
     this.sides = Object.fromEntries(names.map((name) => [name, this.side(face)]));
-    for (const name of ["tableA", "tableB"]) if (this[name]) gl.deleteTexture(this[name]);
     this.tableA = table3d(gl, face.tableShape, face.tableA);
     this.tableB = face.tableB ? table3d(gl, face.tableShape, face.tableB) : this.tableA;
+    this.lobes = halfTexture(gl, face.tableLobes.length / 8, 2, gl.HALF_FLOAT, face.tableLobes);
   }
 
   side(face) {
@@ -66,72 +60,88 @@ class Painter {
       buffer(gl, 6, 2, gl.FLOAT, face.uv), buffer(gl, 7, 1, gl.FLOAT, face.spacing),
       buffer(gl, 8, 2, gl.FLOAT, face.quality),
     ];
+    attribute(gl, 9, 4, gl.FLOAT, this.ambient);
     const index = gl.createBuffer();
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, index);
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, face.triangles, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
     const list = gl.createBuffer();  // of the visible triangles, made again for each view
-    return { vao, buffers: [...buffers, index, list], index, list, visible: this.visible, seen: "", size: 0 };
+    return { vao, buffers: [...buffers, index, list], index, list, visible: this.visible, values: face, seen: "", size: 0, glow: {}, spread: 0 };
   }
 
-  // `differ` is whether this side differs from the plain one
-  update(name, values, differ) {
-    this.edits += 1;
+  // Changes the values of the edited side; `differ` is whether it differs from the plain one.
+  update(values, differ) {
+    const gl = this.gl, side = this.sides.edited, changed = VALUES.filter((name) => values[name] !== side.values[name]);
     this.differ = differ;
-    this.fresh[name] = false;
-    const gl = this.gl, side = this.sides[name];
-    if (!side) return;
-    VALUES.forEach((name, at) => {
-      gl.bindBuffer(gl.ARRAY_BUFFER, side.buffers[at]);
-      gl.bufferSubData(gl.ARRAY_BUFFER, 0, values[name]);
-    });
-    const { position, triangles } = this.face;
-    this.moved = values.position.some((x, i) => x !== position[i]);
-    side.visible = this.moved ? new VisibleTriangles({ position: values.position, triangles }) : this.visible;
-    side.seen = this.shadowed = "";
-  }
-
-  // Draws a picture, or the next part of a picture under many lights; returns the fraction of the picture that is done.
-  draw(state) {
-    const gl = this.gl;
-    if (!this.face || gl.isContextLost()) return 1;
-    const lights = state.lights.slice(0, MAX_LIGHTS);
-    if (state.surroundings && state.surroundings.length && !state.component && this.floats) {
-      return this.drawSum(state, [...(lights.length ? [lights] : []), ...batches(state.surroundings)]);
-    }
     this.sum = null;
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.viewport(0, 0, this.canvas.width, this.canvas.height);
-    gl.clearColor(...state.background, 1);
-    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    this.drawSides(state, lights, null);
-    return 1;
-  }
-
-  // Adds four lights at a time, so that many lights take more time but no other code.
-  drawSum(state, parts) {
-    const gl = this.gl, { width, height } = this.canvas;
-    const asked = JSON.stringify([{ ...state, background: 0 }, this.edits, width, height], (key, value) => (key === "inputs" ? 0 : value));
-    if (!this.sum || this.sum.asked !== asked) this.beginSum(asked);
-    if (this.sum.done < parts.length) {
-      this.drawSides(state, parts[this.sum.done], this.sums);
-      this.sum.done += 1;
-      this.sum.power += power(parts[this.sum.done - 1]);
+    for (const name of changed) {
+      gl.bindBuffer(gl.ARRAY_BUFFER, side.buffers[VALUES.indexOf(name)]);
+      gl.bufferSubData(gl.ARRAY_BUFFER, 0, values[name]);
     }
-    const whole = parts.reduce((sum, part) => sum + power(part), 0);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.viewport(0, 0, width, height);
-    gl.disable(gl.DEPTH_TEST);
-    gl.activeTexture(gl.TEXTURE1);
-    gl.bindTexture(gl.TEXTURE_2D, this.sums.texture);
-    const gain = this.sum.power > 0 ? whole / this.sum.power : 1;  // a preview of the picture before it is complete
-    setUniforms(gl, this.programs.shown, { source: ["1i", 1], gain: ["1f", gain], background: ["3fv", state.background] });
-    gl.bindVertexArray(this.empty);
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
-    return this.sum.done / parts.length;
+    side.values = values;
+    if (changed.some((name) => ["position", "normal", "diffusion"].includes(name))) Object.assign(side, { glow: {}, spread: 0 });
+    if (!changed.includes("position")) return;
+    const { triangles } = this.face;
+    side.visible = this.isMoved() ? new VisibleTriangles({ position: values.position, triangles }) : this.visible;
+    side.seen = "";
+    this.shadowed = [];
   }
 
-  beginSum(asked) {
+  isMoved() { return this.sides.edited && this.sides.edited.values.position !== this.face.position; }
+
+  // Draws a picture, or the next part of a picture in an environment; returns the fraction that is done. With
+  // `coarse`, while something moves, the environment has a smooth reflection and, without a graphics card, light under
+  // the skin has fewer texels.
+  draw(state, coarse = false) {
+    const gl = this.gl, { width, height } = this.canvas, lights = state.lights.slice(0, MAX_LIGHTS);
+    if (!this.face || gl.isContextLost()) return 1;
+    this.updateSky(state.around);
+    const shown = { lights, sums: null, mirror: state.around.on, coarse: coarse && this.software };
+    const asked = JSON.stringify([{ ...state, background: 0 }, width, height, coarse], (key, value) => (key === "inputs" ? 0 : value));
+    const isSum = state.around.on && state.withSurface && !state.component && this.floats && !coarse;
+    if (!isSum || !this.sum || this.sum.asked !== asked) {
+      this.clear(null, state.background);
+      this.drawSides(state, shown);
+      this.sum = { asked, done: -1 };
+      return isSum ? 0 : 1;
+    }
+    return this.sum.done === batches(this.distant).length ? 1 : this.drawSum(state, shown);
+  }
+
+  clear(frame, background) {
+    const gl = this.gl;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+    gl.viewport(0, 0, this.canvas.width, this.canvas.height);
+    gl.clearColor(...(background || [0, 0, 0]), background ? 1 : 0);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+  }
+
+  // Adds the reflection of four lights of the environment, and shows the picture when it has all.
+  drawSum(state, shown) {
+    const gl = this.gl, parts = batches(this.distant), { sum } = this;
+    if (sum.done < 0) {
+      this.beginSum();
+      this.drawSides(state, { ...shown, sums: this.sums, mirror: false });
+    } else {
+      this.drawSides({ ...state, withDiffuse: false, softness: 1 }, { ...shown, lights: parts[sum.done], sums: this.sums, mirror: false });
+    }
+    sum.done += 1;
+    if (sum.done === parts.length) {
+      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+      gl.viewport(0, 0, this.canvas.width, this.canvas.height);
+      gl.disable(gl.DEPTH_TEST);
+      this.bindTextures([[gl.TEXTURE_2D, null], [gl.TEXTURE_2D, this.sums.texture]]);
+      setUniforms(gl, this.programs.shown, {
+        source: ["1i", 1], background: ["4fv", state.background ? [...state.background, 1] : [0, 0, 0, 0]], toned: ["1i", state.toned ? 1 : 0],
+      });
+      gl.bindVertexArray(this.empty);
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+      return 1;
+    }
+    return (sum.done + 1) / (parts.length + 1);
+  }
+
+  beginSum() {
     const gl = this.gl, { width, height } = this.canvas;
     if (!this.sums || this.sums.width !== width || this.sums.height !== height) {
       if (this.sums) {
@@ -141,38 +151,40 @@ class Painter {
       }
       this.sums = sumTarget(gl, width, height);
     }
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.sums.frame);
     gl.depthMask(true);
-    gl.clearColor(0, 0, 0, 0);
-    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    this.sum = { asked, done: 0, power: 0 };
+    this.clear(this.sums.frame, null);
+  }
+
+  // the irradiance by the environment at the surfels, and its mirror image
+  updateSky(around) {
+    const sky = JSON.stringify(around), gl = this.gl;
+    if (sky === this.sky) return;
+    this.sky = sky;
+    this.distant = around.on ? distantLights(this.face, around) : [];
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.ambient);
+    gl.bufferSubData(gl.ARRAY_BUFFER, 0, skyIrradiance(this.face, this.distant));
+    gl.deleteTexture(this.mirror);
+    this.mirror = halfTexture(gl, MIRROR.width, MIRROR.height, gl.FLOAT, mirrorImage(this.distant));
   }
 
   // Draws both sides of the divider under some lights, into the canvas or added to a sum.
-  drawSides(state, lights, sums) {
-    const gl = this.gl, { width, height } = this.canvas, { uniforms, matrices } = this.lightUniforms(lights, state);
-    // shadows and light under the skin do not change while only the view turns
-    const lit = JSON.stringify([lights.map(({ inputs, ...rest }) => rest), state.softness]);
-    if (lit !== this.lit) this.fresh = {};
-    this.lit = lit;
+  drawSides(state, shown) {
+    const gl = this.gl, { width, height } = this.canvas, { sums, lights } = shown;
+    const { uniforms, matrices } = this.lightUniforms(lights, state);
     const cut = this.differ ? Math.round(state.divider * width) : width;
-    const parts = [["plain", 0, cut], ["edited", cut, width - cut]];
-    for (const [name, left, size] of parts) {
+    for (const [name, left, size] of [["plain", 0, cut], ["edited", cut, width - cut]]) {
       if (size <= 0) continue;
-      const shape = this.moved ? name : "plain";
-      if (this.shadowed !== lit + shape) this.drawShadows(matrices, shape);
-      this.shadowed = lit + shape;
-      const glow = state.glow && this.glows && state.withDiffuse;
-      if (glow && !this.fresh[name]) this.drawGlow(name, uniforms);
-      this.fresh[name] = this.fresh[name] || glow;
+      if (!state.component) this.drawShadows(matrices, this.isMoved() ? name : "plain");
+      const glow = state.glow && this.floats && state.withDiffuse && !state.component ? this.glow(name, uniforms, shown, state) : null;
       gl.bindFramebuffer(gl.FRAMEBUFFER, sums ? sums.frame : null);
       gl.viewport(0, 0, width, height);
       gl.enable(gl.SCISSOR_TEST);
       gl.scissor(left, 0, size, height);
       const span = [left, left + size].map((column) => (2 * column) / width - 1);
-      if (sums && this.sum.done === 0) {  // depths first, so that every pixel is added once
+      const view = { ...shown, uniforms, glow, span };
+      if (sums && this.sum.done < 0) {  // depths first, so that every pixel is added once
         gl.colorMask(false, false, false, false);
-        this.drawFace(name, state, uniforms, glow, true, span);
+        this.drawFace(name, state, view);
         gl.colorMask(true, true, true, true);
       }
       if (sums) {
@@ -181,7 +193,7 @@ class Painter {
         gl.enable(gl.BLEND);
         gl.blendFunc(gl.ONE, gl.ONE);
       }
-      this.drawFace(name, state, uniforms, glow, Boolean(sums), span);
+      this.drawFace(name, state, view);
       gl.depthFunc(gl.LESS);
       gl.depthMask(true);
       gl.disable(gl.BLEND);
@@ -213,6 +225,12 @@ class Painter {
     return { uniforms, matrices };
   }
 
+  bindTextures(textures) {
+    const gl = this.gl;
+    textures.forEach(([kind, texture], i) => { gl.activeTexture(gl.TEXTURE0 + i); gl.bindTexture(kind, texture); });
+  }
+
+  // Draws the shadow maps of lights that have moved, or of another shape.
   drawShadows(matrices, name) {
     const gl = this.gl, side = this.sides[name];
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.shadow.frame);
@@ -221,6 +239,8 @@ class Painter {
     gl.disable(gl.CULL_FACE);
     gl.bindVertexArray(side.vao);
     matrices.forEach((matrix, i) => {
+      if (this.shadowed[i] === name + matrix) return;
+      this.shadowed[i] = name + matrix;
       gl.framebufferTextureLayer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, this.shadow.texture, 0, i);
       gl.clear(gl.DEPTH_BUFFER_BIT);
       setUniforms(gl, this.programs.depth, { matrix: ["mat4", matrix] });
@@ -228,19 +248,33 @@ class Painter {
     });
   }
 
-  drawGlow(name, uniforms) {
-    const gl = this.gl, [light, across, radius] = this.glows, { face } = this;
-    const blurred = (this.blurred[name] = this.blurred[name] || target(gl, GLOW_SIZE));
+  // Light under the skin of a side as a texture. Sides with equal shape and translucency share it, and it stays the
+  // same while only the view turns.
+  glow(name, uniforms, { lights, coarse }, state) {
+    const { values } = this.sides[name], shares = ["position", "normal", "diffusion"].every((one) => values[one] === this.face[one]);
+    const side = this.sides[shares ? "plain" : name], size = coarse ? COARSE_GLOW_SIZE : GLOW_SIZE;
+    const lit = JSON.stringify([lights.map(({ inputs, ...rest }) => rest), state.softness, this.sky]);
+    if (side.glow.lit !== lit || side.glow.size < size) this.drawGlow(side, uniforms, size);
+    side.glow = { lit, size: Math.max(size, side.glow.lit === lit ? side.glow.size : 0), texture: side.blurred.texture };
+    return side.glow.texture;
+  }
+
+  drawGlow(side, uniforms, size) {
+    const gl = this.gl, { face } = this;
+    this.glows[size] = this.glows[size] || ["irradiance", "across"].map(() => target(gl, size));
+    side.targets = side.targets || {};
+    side.targets[size] = side.targets[size] || ["radius", "blurred"].map(() => target(gl, size));
+    const [light, across] = this.glows[size], [radius, blurred] = side.targets[size];
+    side.blurred = blurred;
     gl.disable(gl.DEPTH_TEST);
     gl.disable(gl.CULL_FACE);
-    gl.viewport(0, 0, GLOW_SIZE, GLOW_SIZE);
-    gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D_ARRAY, this.shadow.texture);
-    gl.bindVertexArray(this.sides[name].vao);
-    for (const [to, program, values] of [
-      [radius, "radius", { width: ["3fv", face.diffusionWidth.map((x) => x * GLOW_SIZE)] }],
-      [light, "irradiance", uniforms],
-    ]) {
+    gl.viewport(0, 0, size, size);
+    this.bindTextures([[gl.TEXTURE_2D_ARRAY, this.shadow.texture]]);
+    gl.bindVertexArray(side.vao);
+    const passes = [[light, "irradiance", uniforms]];
+    if (side.spread !== size) passes.push([radius, "radius", { width: ["3fv", face.diffusionWidth.map((x) => x * size)] }]);
+    side.spread = size;
+    for (const [to, program, values] of passes) {
       gl.bindFramebuffer(gl.FRAMEBUFFER, to.frame);
       gl.clearColor(0, 0, 0, 0);
       gl.clear(gl.COLOR_BUFFER_BIT);
@@ -250,35 +284,33 @@ class Painter {
     gl.bindVertexArray(this.empty);
     for (const [from, to, along] of [[light, across, [1, 0]], [across, blurred, [0, 1]]]) {
       gl.bindFramebuffer(gl.FRAMEBUFFER, to.frame);
-      gl.activeTexture(gl.TEXTURE1);
-      gl.bindTexture(gl.TEXTURE_2D, from.texture);
-      gl.activeTexture(gl.TEXTURE2);
-      gl.bindTexture(gl.TEXTURE_2D, radius.texture);
+      this.bindTextures([[gl.TEXTURE_2D_ARRAY, this.shadow.texture], [gl.TEXTURE_2D, from.texture], [gl.TEXTURE_2D, radius.texture]]);
       setUniforms(gl, this.programs.blur, { source: ["1i", 1], radius: ["1i", 2], along: ["2fv", along] });
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
   }
 
   // `span` is the part of the picture that is drawn, as horizontal places from -1 to 1
-  drawFace(name, state, lights, glow, linear, span) {
+  drawFace(name, state, { uniforms, glow, sums, mirror, span }) {
     const gl = this.gl, { width, height } = this.canvas, { face } = this;
     const eye = state.eye || add(face.centre, direction(state.azimuth, state.elevation), state.distance);
     const reach = Math.hypot(...sub(eye, face.centre));
     const near = Math.max(reach - 1.2 * face.radius, 1), far = reach + 1.2 * face.radius;
-    const matrix = product(perspective(state.tangent, width / height, near, far), lookAt(eye, state.target || face.centre, [0, 1, 0]));
+    const tangent = state.tangent / Math.min(1, (FACE_HEIGHT_OVER_WIDTH * width) / height);  // a narrow picture shows the whole face
+    const matrix = product(perspective(tangent, width / height, near, far), lookAt(eye, state.target || face.centre, [0, 1, 0]));
     gl.enable(gl.DEPTH_TEST);
     gl.enable(gl.CULL_FACE);
-    const textures = [
+    this.bindTextures([
       [gl.TEXTURE_2D_ARRAY, this.shadow.texture], [gl.TEXTURE_3D, this.tableA], [gl.TEXTURE_3D, this.tableB],
-      [gl.TEXTURE_2D, glow ? this.blurred[name].texture : null],
-    ];
-    textures.forEach(([kind, texture], i) => { gl.activeTexture(gl.TEXTURE0 + i); gl.bindTexture(kind, texture); });
+      [gl.TEXTURE_2D, glow], [gl.TEXTURE_2D, this.mirror], [gl.TEXTURE_2D, this.lobes],
+    ]);
     const program = state.component ? "components" : face.tableB ? "faceOfMany" : "face";
     setUniforms(gl, this.programs[program], {
-      ...lights, matrix: ["mat4", matrix], eye: ["3fv", eye], exposure: ["1f", state.exposure * face.exposure],
-      tableA: ["1i", 1], tableB: ["1i", 2], glow: ["1i", 3],
+      ...uniforms, matrix: ["mat4", matrix], eye: ["3fv", eye], exposure: ["1f", state.exposure * face.exposure],
+      tableA: ["1i", 1], tableB: ["1i", 2], glow: ["1i", 3], mirror: ["1i", 4], lobes: ["1i", 5],
       withDiffuse: ["1i", state.withDiffuse ? 1 : 0], withSurface: ["1i", state.withSurface ? 1 : 0],
-      withGlow: ["1i", glow ? 1 : 0], linear: ["1i", linear ? 1 : 0], component: ["1i", state.component],
+      withGlow: ["1i", glow ? 1 : 0], withMirror: ["1i", mirror ? 1 : 0],
+      linear: ["1i", sums ? 1 : 0], toned: ["1i", state.toned ? 1 : 0], component: ["1i", state.component],
     });
     const side = this.sides[name];
     gl.bindVertexArray(side.vao);

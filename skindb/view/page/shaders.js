@@ -41,9 +41,17 @@ float lit(int i, vec3 position, vec3 normal) {
 `;
 
 const ENCODE = `
+uniform bool toned;
 vec3 encode(vec3 x) {
   x = clamp(x, 0.0, 1.0);
   return mix(12.92 * x, 1.055 * pow(x, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, x));
+}
+// compresses values above 0.8 (Khronos PBR Neutral, whose shift for a reflectance of 4 % is left out)
+vec3 shown(vec3 x) {
+  float start = 0.8, range = 1.0 - start, peak = max(x.r, max(x.g, x.b));
+  if (!toned || peak < start) return encode(x);
+  float compressed = 1.0 - range * range / (peak + range - start);
+  return encode(mix(vec3(compressed), x * (compressed / peak), 1.0 / (0.15 * (peak - compressed) + 1.0)));
 }`;
 
 // a triangle that covers the picture
@@ -68,16 +76,17 @@ void main() {}`,
 layout(location = 0) in vec3 position;
 layout(location = 1) in vec3 normal;
 layout(location = 6) in vec2 uv;
-out vec3 vPosition; out vec3 vNormal;
+layout(location = 9) in vec4 ambient;
+out vec3 vPosition; out vec3 vNormal; out vec3 vAmbient;
 void main() {
-  vPosition = position; vNormal = normal;
+  vPosition = position; vNormal = normal; vAmbient = ambient.rgb;
   gl_Position = vec4(uv * 2.0 - 1.0, 0.0, 1.0);
 }`,
     fragment: COMMON + `
-in vec3 vPosition; in vec3 vNormal;
+in vec3 vPosition; in vec3 vNormal; in vec3 vAmbient;
 out vec4 result;
 void main() {
-  vec3 n = normalize(vNormal), sum = vec3(0.0);
+  vec3 n = normalize(vNormal), sum = vAmbient;
   for (int i = 0; i < lightCount; i++) {
     vec3 way = lightPosition[i] - vPosition;
     float square = dot(way, way), c = dot(way, n) * inversesqrt(square);
@@ -116,16 +125,18 @@ uniform vec2 along;
 out vec4 result;
 void main() {
   vec2 size = vec2(textureSize(source, 0)), at = gl_FragCoord.xy / size;
-  vec4 middle = texture(source, at);
-  vec3 sigma = texture(radius, at).rgb, sum = vec3(0.0), weight = vec3(1e-6);
-  for (int k = -6; k <= 6; k++) {
+  vec4 middle = texelFetch(source, ivec2(gl_FragCoord.xy), 0);
+  result = vec4(0.0);
+  if (middle.a == 0.0) return;
+  vec3 sigma = max(texelFetch(radius, ivec2(gl_FragCoord.xy), 0).rgb, 0.02), sum = vec3(0.0), weight = vec3(1e-6);
+  float widest = max(sigma.r, max(sigma.g, sigma.b));
+  vec3 sharpness = 0.5 * widest * widest / (sigma * sigma);
+  for (int k = -6; k <= 6; k++) {  // the channels share the taps, which suffice for widths in a ratio of up to 5
     float x = float(k) * 0.45;
-    float g = exp(-0.5 * x * x);
-    for (int c = 0; c < 3; c++) {
-      vec4 tap = texture(source, at + along * (x * sigma[c]) / size);
-      sum[c] += g * tap[c];
-      weight[c] += g * tap.a;
-    }
+    vec4 tap = texture(source, at + along * (x * widest) / size);
+    vec3 g = exp(-sharpness * x * x);
+    sum += g * tap.rgb;
+    weight += g * tap.a;
   }
   result = vec4(sum / weight * middle.a, middle.a);
 }`,
@@ -173,13 +184,14 @@ layout(location = 2) in vec3 albedo;
 layout(location = 3) in vec4 weightA;
 layout(location = 4) in vec4 weightB;
 layout(location = 6) in vec2 uv;
+layout(location = 9) in vec4 ambient;
 uniform mat4 matrix;
-out vec3 vPosition; out vec3 vNormal; out vec3 vAlbedo; out vec4 vWeightA; out vec2 vUv;
+out vec3 vPosition; out vec3 vNormal; out vec3 vAlbedo; out vec4 vWeightA; out vec2 vUv; out vec4 vAmbient;
 #ifdef SECOND_TABLE
 out vec4 vWeightB;
 #endif
 void main() {
-  vPosition = position; vNormal = normal; vAlbedo = albedo; vWeightA = weightA; vUv = uv;
+  vPosition = position; vNormal = normal; vAlbedo = albedo; vWeightA = weightA; vUv = uv; vAmbient = ambient;
 #ifdef SECOND_TABLE
   vWeightB = weightB;
 #endif
@@ -192,8 +204,12 @@ uniform sampler2D glow;
 uniform vec3 eye;
 uniform float exposure;
 uniform bool withDiffuse, withSurface, withGlow;
+uniform bool withMirror;  // whether the surface reflects a smooth image of the environment
+uniform sampler2D mirror;
+uniform sampler2D lobes;  // directional albedo of the bases
 uniform bool linear;  // whether to output radiance, to be summed, instead of a display colour
-in vec3 vPosition; in vec3 vNormal; in vec3 vAlbedo; in vec4 vWeightA; in vec2 vUv;
+const float MIN_COSINE = 0.03;
+in vec3 vPosition; in vec3 vNormal; in vec3 vAlbedo; in vec4 vWeightA; in vec2 vUv; in vec4 vAmbient;
 #ifdef SECOND_TABLE
 in vec4 vWeightB;
 #endif
@@ -218,29 +234,39 @@ void main() {
   vec3 n = normalize(vNormal);
   vec3 wo = normalize(eye - vPosition), matte = vec3(0.0), gloss = vec3(0.0);
   float cosO = dot(n, wo);
-  if (cosO > 0.0) {
-    float leaves = transmittance(min(cosO, 1.0));
-    for (int i = 0; i < lightCount; i++) {
-      vec3 way = lightPosition[i] - vPosition;
-      float square = dot(way, way);
-      vec3 wi = way * inversesqrt(square);
-      float cosI = dot(wi, n);
-      if (cosI <= 0.0) continue;
-      vec3 received = lightIntensity[i] * (cosI / square * lit(i, vPosition, n));
-      if (!withGlow) matte += received * (transmittance(min(cosI, 1.0)) * leaves / PI);
-      if (withSurface) {
-        vec3 at = place(n, wi, wo);
-        float sum = dot(vWeightA, texture(tableA, at));
+  if (cosO < MIN_COSINE) n = normalize(n + (MIN_COSINE - cosO) * wo);  // no black line where shading normals turn away
+  cosO = clamp(cosO, MIN_COSINE, 1.0);
+  float leaves = transmittance(cosO);
+  for (int i = 0; i < lightCount; i++) {
+    vec3 way = lightPosition[i] - vPosition;
+    float square = dot(way, way);
+    vec3 wi = way * inversesqrt(square);
+    float cosI = dot(wi, n);
+    if (cosI <= 0.0) continue;
+    float visible = lit(i, vPosition, n);
+    if (visible == 0.0) continue;
+    vec3 received = lightIntensity[i] * (cosI / square * visible);
+    if (!withGlow) matte += received * (transmittance(min(cosI, 1.0)) * leaves / PI);
+    if (withSurface) {
+      vec3 at = place(n, wi, wo);
+      float sum = dot(vWeightA, texture(tableA, at));
 #ifdef SECOND_TABLE
-        sum += dot(vWeightB, texture(tableB, at));
+      sum += dot(vWeightB, texture(tableB, at));
 #endif
-        gloss += received * sum;
-      }
+      gloss += received * sum;
     }
-    if (withGlow) matte = texture(glow, vUv).rgb * (leaves / PI);
+  }
+  matte = withGlow ? texture(glow, vUv).rgb * (leaves / PI) : matte + vAmbient.rgb * (leaves / PI);
+  if (withSurface && withMirror) {
+    vec3 way = reflect(-wo, n);
+    float albedo = dot(vWeightA, texture(lobes, vec2(cosO, 0.25)));
+#ifdef SECOND_TABLE
+    albedo += dot(vWeightB, texture(lobes, vec2(cosO, 0.75)));
+#endif
+    gloss += texture(mirror, vec2(atan(way.x, way.z) / (2.0 * PI) + 0.5, acos(clamp(way.y, -1.0, 1.0)) / PI)).rgb * (albedo * vAmbient.a);
   }
   vec3 radiance = (withDiffuse ? matte * vAlbedo : vec3(0.0)) + gloss;
-  result = vec4(linear ? radiance * exposure : encode(radiance * exposure), 1.0);
+  result = vec4(linear ? radiance * exposure : shown(radiance * exposure), 1.0);
 }`,
   },
 
@@ -250,13 +276,12 @@ void main() {
     fragment: `#version 300 es
 precision highp float;
 uniform sampler2D source;
-uniform float gain;
-uniform vec3 background;
+uniform vec4 background;
 out vec4 result;
 ${ENCODE}
 void main() {
   vec4 sum = texelFetch(source, ivec2(gl_FragCoord.xy), 0);
-  result = vec4(sum.a > 0.0 ? encode(sum.rgb * gain) : background, 1.0);
+  result = sum.a > 0.0 ? vec4(shown(sum.rgb), 1.0) : background;
 }`,
   },
 };

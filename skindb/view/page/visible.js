@@ -6,19 +6,25 @@ class VisibleTriangles {
     const count = triangles.length / 3;
     Object.assign(this, { position, triangles, planes: new Float32Array(4 * count), chosen: new Uint32Array(triangles.length) });
     this.across = new Float32Array(position.length / 3);  // horizontal place in the picture, from -1 to 1
+    const { planes } = this;
     for (let i = 0; i < count; i++) {
-      const [a, b, c] = [0, 1, 2].map((k) => position.subarray(3 * triangles[3 * i + k], 3 * triangles[3 * i + k] + 3));
-      const ux = b[0] - a[0], uy = b[1] - a[1], uz = b[2] - a[2], vx = c[0] - a[0], vy = c[1] - a[1], vz = c[2] - a[2];
+      const a = 3 * triangles[3 * i], b = 3 * triangles[3 * i + 1], c = 3 * triangles[3 * i + 2];
+      const px = position[a], py = position[a + 1], pz = position[a + 2];
+      const ux = position[b] - px, uy = position[b + 1] - py, uz = position[b + 2] - pz;
+      const vx = position[c] - px, vy = position[c + 1] - py, vz = position[c + 2] - pz;
       const x = uy * vz - uz * vy, y = uz * vx - ux * vz, z = ux * vy - uy * vx, size = Math.hypot(x, y, z) || 1;
-      this.planes.set([x / size, y / size, z / size, (x * a[0] + y * a[1] + z * a[2]) / size], 4 * i);
+      planes[4 * i] = x / size;
+      planes[4 * i + 1] = y / size;
+      planes[4 * i + 2] = z / size;
+      planes[4 * i + 3] = (x * px + y * py + z * pz) / size;
     }
   }
 
   // Indices of the triangles that face the eye and reach between two horizontal places, from -1 to 1. Triangles that
-  // are seen from the side are kept: the graphics library decides about them.
+  // are seen from the side, within a degree, are kept: rounding of their corners to parts of a pixel may turn them to the eye.
   select(eye, matrix, from, to) {
     const { position, triangles, planes, chosen, across } = this;
-    const [x, y, z] = eye, tolerance = 1e-4 * Math.hypot(x, y, z);
+    const [x, y, z] = eye, tolerance = 2e-2 * Math.hypot(x, y, z);
     for (let i = 0, k = 0; i < across.length; i++, k += 3) {
       const a = position[k], b = position[k + 1], c = position[k + 2];
       const w = matrix[3] * a + matrix[7] * b + matrix[11] * c + matrix[15];
