@@ -419,8 +419,8 @@ class _DomeRun(_Run):
         }
         if lumitexels.photographs:
             groups["photographs"] = photograph_group(lumitexels.photographs)
-        if lumitexels.detail is not None:
-            groups["detail"] = lumitexels.detail.group()
+        if lumitexels.detail and (detail := lumitexels.detail.group()):
+            groups["detail"] = detail
         if lumitexels.calibration is not None:
             groups["calibration"] = calibration_group(
                 dome, lumitexels.calibration, rotations

@@ -33,7 +33,9 @@ from skindb.types import (
 
 # spacing of the surfels over the width of a pixel, from which on detail is estimated
 MIN_SPACING_PIXELS = 2.0
-MAX_TEXELS = 2048  # along a side of the atlas; they take 0.9 GB while views are sampled
+MAX_TEXELS = (
+    1024  # along a side of the atlas; 1 kB of memory for each while views are sampled
+)
 MIN_COSINE = (
     0.25  # to light and camera, as farther away pixels and shadows are too wide
 )
@@ -129,8 +131,8 @@ class Detail:
             self.sums[j % 2],
         )
 
-    def group(self) -> xr.Dataset:
-        """Group "detail": the differences and their errors.
+    def group(self) -> xr.Dataset | None:
+        """Group "detail": the differences and their errors; None if none is determined.
 
         The noise is that of half the difference between the estimates by every other light.
         In a window, the part of the variance that is not noise is the factor by which the
@@ -140,6 +142,8 @@ class Detail:
         estimates = [self.sums.sum(axis=0), *self.sums]
         values = np.stack([self._differences(sums) for sums in estimates])
         known = np.isfinite(values).all(axis=(0, 2))
+        if not known.any():
+            return None
         at = np.unravel_index(self.texel[known], (self.size, self.size))
         cover = np.zeros((self.size, self.size, 1), np.float32)
         cover[at] = 1

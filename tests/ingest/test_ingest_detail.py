@@ -52,7 +52,7 @@ def test_add_samples__normal_equations_of_chosen_views():
         assert solved == pytest.approx(expected, rel=1e-4, abs=1e-5)
 
 
-def sheet_detail(pattern: float, noise: float, seed: int):
+def sheet_detail(pattern: float, noise: float, seed: int, lights: int = 24):
     """True detail of a flat sheet with a random pattern of R_d, and the group."""
     rng = np.random.default_rng(seed)
     size, spacing = 128, 8
@@ -92,7 +92,9 @@ def sheet_detail(pattern: float, noise: float, seed: int):
         size, BLUR_PIXELS, texel, corners, weight, position, normal, (), sums
     )
     camera = np.array([0.0, 0, 800])
-    for j, way in enumerate(unit(rng.normal(0, 1, (24, 3)) * [1, 1, 0.3] + [0, 0, 1])):
+    for j, way in enumerate(
+        unit(rng.normal(0, 1, (lights, 3)) * [1, 1, 0.3] + [0, 0, 1])
+    ):
         towards = unit(800 * way - position)
         rho = (albedo * towards[:, 2])[:, None] * [0.18, 0.12, 0.08]
         rho = rho * (1 + noise * rng.standard_normal(rho.shape))
@@ -133,6 +135,11 @@ def test_detail__shrinks_noise_to_nothing():
     """
     _, group = sheet_detail(0.0, 0.03, 1)
     assert group["diffuse_detail"].values.astype(float).std() < 0.003
+
+
+def test_detail__four_lights_do_not_determine_it():
+    # two in each half
+    assert sheet_detail(0.1, 0.0, 2, lights=4)[1] is None
 
 
 def test_ingest_capture__detail_of_pores_and_wrinkles(tmp_path):
