@@ -129,7 +129,7 @@ def test_camera_scaled__refuses_pictures_that_do_not_fit_into_memory() -> None:
     small = Camera(np.eye(3), np.eye(3), np.zeros(3), np.zeros(5), 32, 24)
     with pytest.raises(
         InputError,
-        match=r"a picture must have 1 to [\d,]+ pixels; found \d+ x \d+; choose a smaller",
+        match=r"a picture must have 1 to [\d,]+ pixels; found \d+ x \d+; choose another",
     ):
         small.scaled(1e4)
 
