@@ -80,7 +80,6 @@ def describe_face_model(model: Dataset) -> list[str]:
     n = model.sizes["subject"]
     errors = model[variables.RECONSTRUCTION_ERROR][0].to_series().round(3).to_dict()
     listed = ", ".join(f"{name} {error:g}" for name, error in errors.items())
-    largest = model[variables.MODE_LARGEST_SUBJECT].values
     nearest = model.attrs["nearest_subject"]
     lines = [
         f"{n} subjects, each with the mean of its takes in the condition normal; "
@@ -91,11 +90,15 @@ def describe_face_model(model: Dataset) -> list[str]:
     ]
     if n < FEW:
         lines.append(f"fewer than {FEW} subjects: modes follow individuals")
-    if nearest < MIN_DISTANCE or (largest > MAX_FRACTION).any():
-        lines.append(
-            "privacy: a mode or the samples show one subject; do not publish them"
-        )
-    return lines
+    return lines + privacy_notes(model)
+
+
+def privacy_notes(model: Dataset) -> list[str]:
+    """A line if a mode or the samples disclose a subject."""
+    largest = model[variables.MODE_LARGEST_SUBJECT].values
+    if model.attrs["nearest_subject"] < MIN_DISTANCE or (largest > MAX_FRACTION).any():
+        return ["privacy: a mode or the samples show one subject; do not publish them"]
+    return []
 
 
 @dataclass(frozen=True)

@@ -305,7 +305,9 @@ def view(
     if explain:
         with workflow.logged_action(database, "view", chosen, explain=True):
             skipped = {
-                take: workflow.explain_view(database, take, traits=amounts)
+                take: workflow.explain_view(
+                    database, take, traits=amounts, modes=parameters.modes
+                )
                 for take in chosen
             }
         lines = [f"{take}: {line}" for take, lines in skipped.items() for line in lines]

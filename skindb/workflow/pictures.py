@@ -1,5 +1,6 @@
 """Pictures, exports and pages of the models of a database."""
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -10,8 +11,9 @@ from typing import Any
 import numpy as np
 from xarray import DataTree
 
+from skindb.analysis.components import privacy_notes
 from skindb.analysis.edit import move_along_modes
-from skindb.errors import input_error, require
+from skindb.errors import SkindbWarning, input_error, require
 from skindb.export.bundle import export_bundle
 from skindb.export.gltf import export_gltf
 from skindb.files import Json, make_private
@@ -465,14 +467,26 @@ def landmark_page(scan: Path, out: Path, *, port: int = 0) -> PageServer:
 
 @logged("view", explain=True)
 def explain_view(
-    db: Database, take: str, *, traits: Mapping[str, float] = NO_TRAITS
+    db: Database,
+    take: str,
+    *,
+    traits: Mapping[str, float] = NO_TRAITS,
+    modes: int = 0,
 ) -> list[str]:
     """What the page of a take would skip and approximate, with bounds, one line each;
     see `view_takes`.
     """
     model = db.read("model", take)
     db.require_consent(take, "export")
-    return page_omissions(model, edited=bool(traits))
+    lines = page_omissions(model, edited=bool(traits))
+    if modes:
+        lines.append(
+            f"sliders of modes: shape, albedo, gloss and translucency are interpolated "
+            f"between 0 and {MODE_END:g} standard deviations (errors stand beside the "
+            "sliders), and the environment's diffuse light is that of the measured shape"
+        )
+        lines += privacy_notes(db.read(STUDY, COMPONENTS)["face_model"].to_dataset())
+    return lines
 
 
 def _moved(
@@ -503,6 +517,8 @@ def _along_modes(
         return ()
     db.require_consent(take, "statistics")
     faces = db.read(STUDY, COMPONENTS)["face_model"].to_dataset().load()
+    for note in privacy_notes(faces):
+        warnings.warn(f"study of components: {note}", SkindbWarning, stacklevel=2)
     require_fresh(db, STUDY, COMPONENTS)
     records = current_registrations(db, [take])
     require(records, take, "must be registered", "none", "run: skindb register DB")

@@ -15,6 +15,7 @@ from skindb import workflow
 from skindb.analysis import describe_study, tabulate_study
 from skindb.analysis.studies import STUDIES
 from skindb.cli import cli
+from skindb.errors import SkindbWarning
 from skindb.store import Database
 from skindb.workflow.pictures import _along_modes
 from skindb.workflow.studies import open_population
@@ -89,12 +90,19 @@ def test_components__first_mode_is_the_step(database, tmp_path):
         assert file["shape/model/pcaVariance"].shape == (2,)
 
 
-def test_along_modes__are_edits_of_the_take(database):
+def test_along_modes__are_edits_of_the_take(database, monkeypatch):
     workflow.components(database)
     model = database.read("model", "S0")
     fitted = model["fitted"].to_dataset().load().assign(refractive_index=1.3)
     model["fitted"] = DataTree(fitted)
-    modes = _along_modes(database, "S0", model, 2)
+    # every subject has a part of each mode
+    monkeypatch.setattr("skindb.analysis.components.MAX_FRACTION", 0.0)
+    note = "privacy: a mode or the samples show one subject"
+    with pytest.warns(SkindbWarning, match=f"study of components: {note}"):
+        modes = _along_modes(database, "S0", model, 2)
+    explained = workflow.explain_view(database, "S0", modes=2)
+    assert explained[-1].startswith(note)
+    assert "0 and 2 standard deviations" in explained[-2]
     assert [mode.name for mode in modes] == ["mode 1", "mode 2"]
     whole, half = (
         np.log(tree["fitted/diffuse_reflectance"] / fitted["diffuse_reflectance"])
