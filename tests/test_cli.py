@@ -29,7 +29,8 @@ from skindb.render.image import read_exr
 from tests.pictures import read_png
 
 COMMANDS = (
-    "demo simulate calibrate capture check-device landmarks register-scan quick import ingest fit "
+    "demo simulate calibrate capture check-device landmarks register-scan calibrate-cameras "
+    "quick import ingest fit "
     "dictionary analyze tidy register reproduce edit render compare show export "
     "view consent release refresh withdraw info audit verify clean"
 ).split()

@@ -17,6 +17,7 @@ from skindb.cli.fitting import dictionary_command, fit
 from skindb.cli.imports import import_command, quick
 from skindb.cli.laboratory import (
     calibrate,
+    calibrate_cameras,
     capture,
     check_device,
     landmarks,
@@ -37,7 +38,14 @@ INTERRUPTED = 130
 
 SECTIONS = {
     "Try": (demo, simulate, quick),
-    "Laboratory": (calibrate, capture, check_device, landmarks, register_scan),
+    "Laboratory": (
+        calibrate_cameras,
+        calibrate,
+        capture,
+        check_device,
+        landmarks,
+        register_scan,
+    ),
     "Measure": (import_command, ingest, fit, compare, dictionary_command),
     "Population": (register, analyze, tidy, edit, reproduce),
     "Pictures": (show, render, view, export),

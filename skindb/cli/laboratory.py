@@ -9,7 +9,7 @@ import click
 import skindb
 from skindb import workflow
 from skindb.cli.options import DB, PATH, PORT, command, options_of
-from skindb.cli.shared import emit, existing, indented, serve, writable
+from skindb.cli.shared import aligned, emit, existing, indented, serve, writable
 from skindb.cli.terminal import bar, wait_for_enter
 from skindb.files import Json
 from skindb.parameters import CalibrationParameters, SessionParameters
@@ -291,3 +291,35 @@ def register_scan(
         f"{report['turn_degrees']:.2f} degrees in the last round",
     ]
     emit(report, lines)
+
+
+@command
+@click.argument("setup", type=PATH)
+@click.option(
+    "--out", type=PATH, required=True, help="New file with the cameras (.json)."
+)
+def calibrate_cameras(setup: Path, out: Path) -> None:
+    """Calibrate the cameras of a dome from pictures of a ChArUco board.
+
+    SETUP/dome/boards.json names the pictures and the board. The result is a dome.json in
+    the frame of the board in its first pose; other keys of SETUP/dome/dome.json are kept.
+    """
+    writable(out, ".json")
+    report = workflow.calibrate_cameras(setup, out)
+    header = [
+        "camera",
+        "poses",
+        "rms [px]",
+        "f +- [px]",
+        "turn +- [deg]",
+        "place +- [mm]",
+    ]
+    keys = (
+        "poses",
+        "rms_px",
+        "focal_error_px",
+        "turn_error_degrees",
+        "position_error_mm",
+    )
+    rows = [[name, *(one[key] for key in keys)] for name, one in report.items()]
+    emit(report, [f"{out}:", *aligned([header, *rows])])

@@ -36,6 +36,7 @@ from .fit import (
     takes_to_fit,
     takes_without_consent,
 )
+from .geometry import calibrate_cameras, register_scan
 from .paper import reproduce
 from .pictures import (
     compare_take,
@@ -50,7 +51,6 @@ from .pictures import (
 )
 from .quicklook import quick
 from .rig import calibrate_rig, describe_rig
-from .scan import register_scan
 from .session import capture_session, check_device, plan_session
 from .simulation import begin_simulation, simulate
 from .studies import STUDY_FUNCTIONS, study, tidy_table
@@ -76,6 +76,7 @@ __all__ = [
     "basis_grid",
     "begin_simulation",
     "calibrate",
+    "calibrate_cameras",
     "calibrate_rig",
     "capture_session",
     "check_device",

@@ -1,4 +1,6 @@
-"""Moving a scan from the frame of its scanner into that of the dome."""
+"""Geometry of a laboratory: cameras from pictures of a board, and scans in the frame of the
+dome.
+"""
 
 import json
 import os
@@ -12,8 +14,10 @@ import trimesh
 import xarray as xr
 from scipy.spatial.transform import Rotation
 
+from skindb.calibration.boards import calibrate_cameras as boards_to_cameras
+from skindb.calibration.boards import read_boards, with_cameras
 from skindb.calibration.setup import read_setup_dome
-from skindb.errors import Fault, require_none
+from skindb.errors import Fault, require, require_none
 from skindb.files import Json, make_private, private_file
 from skindb.format.fields import Fields, read_json
 from skindb.format.folder import read_capture
@@ -32,6 +36,49 @@ CHECK = IngestParameters(
 )
 KEYS = ("mesh", "landmarks")  # of capture.json
 FILES = ("scan.ply", "landmarks.json")
+
+
+def calibrate_cameras(folder: Path, out: Path) -> Json:
+    """Write a dome.json with cameras that pictures of a board calibrate, see
+    `skindb.calibration.boards`.
+
+    Parameters
+    ----------
+    folder
+        Set-up folder with dome/boards.json and its pictures. Of a dome.json beside it,
+        everything but size, matrices and distortion of these cameras is kept.
+    out
+        New file.
+
+    Returns
+    -------
+    dict
+        By camera: rms_px of its corners, number of poses, and standard errors
+        focal_error_px, turn_error_degrees, position_error_mm.
+
+    Raises
+    ------
+    InputError
+        If the file exists or a picture or camera is faulty.
+    """
+    require(not out.exists(), str(out), "must be a new file", "one", "choose another")
+    faults = list[Fault]()
+    before = folder / "dome/dome.json"
+    record = read_json(before, faults) if before.is_file() else {}
+    require_none(faults)
+    boards = read_boards(folder)
+    cameras = boards_to_cameras(boards)
+    _dump(out, with_cameras(record, boards, cameras))
+    return {
+        name: {
+            "rms_px": one.rms,
+            "poses": one.poses,
+            "focal_error_px": float(one.errors[:2].max()),
+            "turn_error_degrees": float(np.degrees(one.errors[9:12].max())),
+            "position_error_mm": float(np.linalg.norm(one.errors[12:])),
+        }
+        for name, one in cameras.items()
+    }
 
 
 def register_scan(

@@ -1,0 +1,324 @@
+"""Cameras from photographs of a ChArUco board: detection by OpenCV, and bundle adjustment."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from skindb.errors import Fault, input_error, require, require_none
+from skindb.format.fields import Fields, read_json
+from skindb.format.frames import CAMERA, filled, read_frame
+from skindb.geometry.camera import Pinhole
+from skindb.limits import MAX_BALL_PLACES, MAX_CAMERAS
+from skindb.types import Array, Float64, Index, float64
+
+FILE = "dome/boards.json"
+POSE = "pose"
+MIN_CORNERS = 8  # in a picture
+MIN_POSES = 4  # of a camera; three determine it without a check
+# rms of a camera; OpenCV finds corners to 0.1 px in sharp pictures
+MAX_REPROJECTION_PX = 1.0
+STEP = 1e-7  # of the finite differences: root of the precision, of at least 1
+OF_CAMERA, OF_POSE = 15, 6  # numbers: fx fy cx cy, distortion, rotation vector, t
+Views = dict[tuple[str, int], tuple[Index, Float64]]  # camera, pose -> corners, pixels
+
+
+@dataclass(frozen=True)
+class Boards:
+    """Pixels of the corners of a board."""
+
+    corners: Float64  # (corner, 3) mm on the board: x right, y up, z to the viewer
+    views: Views
+    sizes: Mapping[str, tuple[int, int]]  # of the pictures of a camera: width, height
+
+
+@dataclass(frozen=True)
+class CalibratedCamera(Pinhole):
+    """A camera with the standard errors of its numbers."""
+
+    errors: Float64  # (15,) of fx fy cx cy [px], distortion, rotation [rad], t [mm]
+    rms: float  # px, of its corners
+    poses: int
+
+
+def read_boards(folder: Path) -> Boards:
+    """Find the corners of the board in the pictures that `dome/boards.json` names.
+
+    Raises
+    ------
+    InputError
+        If the file is faulty, OpenCV is missing, or a picture cannot be read.
+    """
+    try:
+        import cv2
+    except ImportError:
+        raise input_error(
+            str(folder / FILE),
+            "boards are found by OpenCV",
+            "no OpenCV",
+            "pip install 'skindb[cameras]'",
+        ) from None
+    faults = list[Fault]()
+    path = folder / FILE
+    fields = Fields(read_json(path, faults), str(path), faults)
+    template = fields.template("frames", {CAMERA, POSE})
+    count = fields.integer("poses", minimum=MIN_POSES, maximum=MAX_BALL_PLACES)
+    squares = fields.array("squares", (2,)).astype(int)
+    square, marker = (fields.number(n, minimum=0.1) for n in ("square", "marker"))
+    name = fields.text("dictionary", default="DICT_5X5_100")
+    cameras = fields.names("cameras", maximum=MAX_CAMERAS)
+    if not hasattr(cv2.aruco, name):
+        fields.fault("dictionary", "must be one of OpenCV", name)
+    if (squares < 3).any() or not 0 < marker < square:
+        fields.fault(
+            "squares",
+            "a board has 3 or more squares a side, and smaller markers",
+            "others",
+        )
+    require_none(faults)
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    board = cv2.aruco.CharucoBoard(tuple(squares.tolist()), square, marker, dictionary)
+    detector = cv2.aruco.CharucoDetector(board)
+    views: Views = {}
+    sizes = {}
+    for camera in cameras:
+        for pose in range(1, count + 1):
+            file = folder / filled(template, camera=camera, pose=str(pose))
+            if not file.is_file():
+                continue  # not every camera sees every pose
+            frame = float64(read_frame(file)).mean(axis=2)
+            sizes[camera] = (frame.shape[1], frame.shape[0])
+            grey = np.rint(255 * frame / max(frame.max(), 1)).astype(np.uint8)
+            pixels, ids = detector.detectBoard(grey)[:2]
+            if ids is not None and len(ids) >= MIN_CORNERS:
+                # its pixels have their centres at integers
+                views[camera, pose] = (
+                    np.ravel(ids),
+                    float64(pixels).reshape(-1, 2) + 0.5,
+                )
+    middle = squares * square / 2
+    found = float64(board.getChessboardCorners())
+    corners = np.stack(
+        [found[:, 0] - middle[0], middle[1] - found[:, 1], 0 * found[:, 2]], axis=1
+    )
+    return Boards(corners, views, sizes)
+
+
+def calibrate_cameras(boards: Boards) -> dict[str, CalibratedCamera]:
+    """Intrinsics, distortion and poses of all cameras by bundle adjustment (Triggs et al.
+    2000): least squares over cameras and poses of the board, from those of single cameras
+    (Zhang 2000, by OpenCV).
+
+    The frame is that of the board in the first pose: origin in its middle, x to its right,
+    y up, z to the viewer. Standard errors follow from the residuals.
+
+    Raises
+    ------
+    InputError
+        If a camera sees too few poses, shares none with the others, or its corners are more
+        than 1 px (rms) from where the result projects them.
+    """
+    poses_of = defaultdict[str, list[int]](list)
+    for camera, pose in boards.views:
+        poses_of[camera].append(pose)
+    require_none(
+        [
+            Fault(
+                f"camera {camera}",
+                f"must see {MIN_POSES} poses of the board with {MIN_CORNERS} corners each",
+                f"{len(poses_of[camera])}",
+                "take more pictures, sharp and without saturation",
+            )
+            for camera in boards.sizes
+            if len(poses_of[camera]) < MIN_POSES
+        ]
+    )
+    cameras, poses = _start(boards, poses_of)
+    names, numbers = list(cameras), [pose for pose in poses if pose != min(poses)]
+    x = np.concatenate([*cameras.values(), *(poses[pose] for pose in numbers)])
+    parts = {
+        name: slice(OF_CAMERA * i, OF_CAMERA * (i + 1)) for i, name in enumerate(names)
+    }
+    first = OF_CAMERA * len(names)
+    places = {
+        n: slice(first + OF_POSE * i, first + OF_POSE * (i + 1))
+        for i, n in enumerate(numbers)
+    }
+    # rows of a camera follow each other, so that it projects all of its points at once
+    views = sorted(boards.views)
+    ends = np.cumsum([2 * len(boards.views[view][0]) for view in views])
+    rows = dict(zip(views, map(slice, [0, *ends[:-1]], ends), strict=True))
+    pixels = np.concatenate([boards.views[view][1] for view in views]).ravel()
+
+    def differences(x: Float64) -> Float64:
+        projected = []
+        for name in sorted(names):
+            points = [
+                _moved(x[places[pose]], boards.corners[boards.views[camera, pose][0]])
+                if pose in places
+                else boards.corners[boards.views[camera, pose][0]]
+                for camera, pose in views
+                if camera == name
+            ]
+            one = _pinhole(x[parts[name]])
+            projected.append(one.project(np.concatenate(points)).ravel())
+        return float64(np.concatenate(projected) - pixels)
+
+    def slopes(x: Float64) -> Float64:
+        """Finite differences; a row depends on one camera and one pose, so that numbers of
+        different cameras, or poses, are changed at once.
+        """
+        matrix = np.zeros((len(pixels), len(x)))
+        here = differences(x)
+        for count, begin, end in ((OF_CAMERA, 0, first), (OF_POSE, first, len(x))):
+            for i in range(begin, begin + count):
+                step = np.zeros(len(x))
+                step[i:end:count] = STEP * np.maximum(np.abs(x[i:end:count]), 1.0)
+                change = differences(x + step) - here
+                for (camera, pose), row in rows.items():
+                    part = parts[camera] if begin == 0 else places.get(pose)
+                    if part is not None:
+                        column = part.start + i - begin
+                        matrix[row, column] = change[row] / step[column]
+        return matrix
+
+    fit = least_squares(differences, x, slopes, method="lm", x_scale="jac")
+    rms = {
+        name: float(
+            np.sqrt(
+                np.mean(
+                    np.concatenate(
+                        [fit.fun[row] for view, row in rows.items() if view[0] == name]
+                    )
+                    ** 2
+                )
+                * 2
+            )
+        )
+        for name in names
+    }
+    require_none(
+        [
+            Fault(
+                f"camera {name}",
+                f"corners must be {MAX_REPROJECTION_PX:g} px (rms) or less from projections",
+                f"{value:.2f} px",
+                "take pictures of a flat board that stands still, and give its true sizes",
+            )
+            for name, value in rms.items()
+            if not value <= MAX_REPROJECTION_PX
+        ]
+    )
+    variance = float(fit.fun @ fit.fun) / (len(fit.fun) - len(x))
+    error = np.sqrt(variance * np.diagonal(np.linalg.inv(fit.jac.T @ fit.jac)))
+    return {
+        name: CalibratedCamera(
+            **vars(_pinhole(fit.x[parts[name]])),
+            errors=error[parts[name]],
+            rms=rms[name],
+            poses=len(poses_of[name]),
+        )
+        for name in names
+    }
+
+
+def _start(
+    boards: Boards, poses_of: Mapping[str, list[int]]
+) -> tuple[dict[str, Float64], dict[int, Float64]]:
+    """Numbers of the cameras and poses of the board, by chaining those that share most corners."""
+    import cv2
+
+    single: dict[str, Float64] = {}
+    seen = dict[tuple[str, int], Float64]()  # (4, 4), from the board to a camera
+    for camera, poses in poses_of.items():
+        views = [boards.views[camera, pose] for pose in poses]
+        _, K, bent, turns, shifts = cv2.calibrateCamera(
+            [boards.corners[corners].astype(np.float32) for corners, _ in views],
+            [pixels.astype(np.float32) for _, pixels in views],
+            boards.sizes[camera],
+            None,
+            None,
+        )
+        single[camera] = np.array(
+            [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *np.ravel(bent)[:5]]
+        )
+        for pose, turn, shift in zip(poses, turns, shifts, strict=True):
+            seen[camera, pose] = _matrix(
+                np.concatenate([np.ravel(turn), np.ravel(shift)])
+            )
+    begin = min(pose for _, pose in seen)
+    poses_at = {begin: np.eye(4)}  # from the board to the frame of the first pose
+    cameras_at = dict[str, Float64]()  # from that frame to the camera
+    order = sorted(seen, key=lambda view: -len(boards.views[view][0]))
+    while edges := [v for v in order if (v[0] in cameras_at) != (v[1] in poses_at)]:
+        camera, pose = edges[0]
+        if pose in poses_at:
+            cameras_at[camera] = seen[edges[0]] @ np.linalg.inv(poses_at[pose])
+        else:
+            poses_at[pose] = np.linalg.inv(cameras_at[camera]) @ seen[edges[0]]
+    lost = sorted(set(single) - set(cameras_at))
+    require(
+        not lost,
+        "cameras",
+        "must see the first pose of the board, or share poses with cameras that do",
+        ", ".join(lost),
+        "take pictures that two cameras see at once",
+    )
+    cameras = {
+        name: np.concatenate([single[name], _vector(cameras_at[name])])
+        for name in single
+    }
+    return cameras, {pose: _vector(matrix) for pose, matrix in sorted(poses_at.items())}
+
+
+def _matrix(vector: Array) -> Float64:
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_rotvec(vector[:3]).as_matrix()
+    matrix[:3, 3] = vector[3:]
+    return matrix
+
+
+def _vector(matrix: Array) -> Float64:
+    turn = Rotation.from_matrix(matrix[:3, :3]).as_rotvec()
+    return np.concatenate([turn, matrix[:3, 3]])
+
+
+def _moved(vector: Array, points: Array) -> Float64:
+    return float64(Rotation.from_rotvec(vector[:3]).apply(points) + vector[3:])
+
+
+def _pinhole(numbers: Array) -> Pinhole:
+    """The camera of 15 numbers."""
+    fx, fy, cx, cy = numbers[:4]
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    R = Rotation.from_rotvec(numbers[9:12]).as_matrix()
+    return Pinhole(K, R, float64(numbers[12:]), float64(numbers[4:9]))
+
+
+def with_cameras(
+    record: Mapping[str, Any], boards: Boards, cameras: Mapping[str, CalibratedCamera]
+) -> dict[str, Any]:
+    """The content of a dome.json with these cameras: those of the same id keep their other keys."""
+    before = {item.get("id"): item for item in record.get("cameras", [])}
+    found = [
+        before.get(name, {})
+        | {
+            "id": name,
+            "width": boards.sizes[name][0],
+            "height": boards.sizes[name][1],
+            "K": one.K.tolist(),
+            "R": one.R.tolist(),
+            "t": one.t.tolist(),
+            "distortion": one.distortion.tolist(),
+        }
+        for name, one in cameras.items()
+    ]
+    others = [item for name, item in before.items() if name not in cameras]
+    return {**record, "cameras": [*found, *others]}
