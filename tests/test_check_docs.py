@@ -4,6 +4,7 @@ commands.
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
@@ -143,3 +144,12 @@ def test_calls__are_unique_and_use_takes_of_the_demo():
     assert len({tuple(call) for call in found}) == len(found) > 20
     assert ["skindb", "compare", "faces", "V001", "--out", "comparison"] in found
     assert found[-1][1] in check_commands.LAST
+
+
+def test_guides__show_pictures_that_load_quickly():
+    guides = check_docs.ROOT / "docs/howto"
+    for guide in set(guides.glob("*.md")) - {guides / "index.md"}:
+        shown = re.findall(r"\.\./pictures/[\w/]+\.\w+", guide.read_text("utf-8"))
+        assert shown, guide.name
+        for picture in shown:
+            assert (guides / picture).stat().st_size <= 150_000, picture
