@@ -21,7 +21,7 @@ test-all: $(STAMP)
 	$(MAKE) --jobs 2 --output-sync=target commands notebooks
 
 suite: $(STAMP)
-	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder --durations 40
 
 pages: $(STAMP)
 	$(BIN)/python docs/make_variables.py --check

@@ -17,6 +17,7 @@ from skindb.analysis.studies import STUDIES
 from skindb.cli import cli
 from skindb.errors import SkindbWarning
 from skindb.store import Database
+from skindb.workflow import pictures
 from skindb.workflow.pictures import _along_modes
 from skindb.workflow.studies import open_population
 from skindb.workflow.upkeep import repeat_study
@@ -42,6 +43,7 @@ def database(tmp_path_factory):
         )
         model.attrs |= {
             "subject": f"S{i}",
+            "consent_scope": ["statistics", "export"],
             "traits": {"gender": "male" if i % 2 else "female", "age": 20 + 5 * i},
         }
         with db.stage("model", f"S{i}") as stage:
@@ -100,6 +102,8 @@ def test_along_modes__are_edits_of_the_take(database, monkeypatch):
     note = "privacy: a mode or the samples show one subject"
     with pytest.warns(SkindbWarning, match=f"study of components: {note}"):
         modes = _along_modes(database, "S0", model, 2)
+    # of a model with a basis, which these do not have
+    monkeypatch.setattr(pictures, "page_omissions", lambda *_, **__: [])
     explained = workflow.explain_view(database, "S0", modes=2)
     assert explained[-1].startswith(note)
     assert "0 and 2 standard deviations" in explained[-2]
