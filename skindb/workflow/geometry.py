@@ -4,7 +4,6 @@ dome.
 
 import json
 import os
-import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -140,9 +139,10 @@ def register_scan(
     shift = turn = None
     with tempfile.TemporaryDirectory(dir=capture.parent, prefix=".scan-") as folder:
         copy = Path(folder) / "capture"
-        shutil.copytree(
-            capture, copy, copy_function=os.link, ignore=_without_scan(capture)
-        )
+        for file in _without_scan(capture):
+            target = copy / file.relative_to(capture)
+            make_private(target.parent)
+            os.link(file, target)
         for i in range(ROUNDS):
             progress("comparison with the photographs", i, ROUNDS)
             _write(copy, mesh, points, matrix)
@@ -184,10 +184,15 @@ def _record(capture: Path) -> Json:
     return dict(record)
 
 
-def _without_scan(capture: Path) -> Any:
-    """What is not linked, as it is written again."""
-    names = {"capture.json", *FILES, *(str(_record(capture).get(k)) for k in KEYS)}
-    return lambda folder, _: names if Path(folder) == capture else ()
+def _without_scan(capture: Path) -> list[Path]:
+    """Files of a capture except those that are written again."""
+    record = _record(capture)
+    names = {"capture.json", *FILES, *(str(record.get(key)) for key in KEYS)}
+    return [
+        file
+        for file in capture.rglob("*")
+        if file.is_file() and str(file.relative_to(capture)) not in names
+    ]
 
 
 def _write(folder: Path, scan: Scan, points: dict[str, Float64], matrix: Array) -> None:
