@@ -19,6 +19,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+PACKAGES = "Debian: apt install gir1.2-aravis-0.8 python3-gi"
 BUFFER_BYTES = 1 << 28  # of the frames of a camera that wait for the disk
 WAIT_US = 50_000
 # 16-bit numbers of GigE Vision 1 go from 65535 to 1, later ones have 64 bits
@@ -78,10 +79,13 @@ def say(line: str) -> None:
 
 def stream(device: str, folder: Path, features: str) -> None:
     """Write every complete frame until standard input ends."""
-    import gi
+    try:
+        import gi
 
-    gi.require_version("Aravis", "0.8")
-    from gi.repository import Aravis
+        gi.require_version("Aravis", "0.8")
+        from gi.repository import Aravis
+    except (ImportError, ValueError):
+        raise RuntimeError(f"no Aravis for {sys.executable} ({PACKAGES})") from None
 
     camera = Aravis.Camera.new(device)
     camera.get_device().set_features_from_string(features)

@@ -50,7 +50,13 @@ class StreamingCameras(FolderCameras):
         }
         fields.require_known("must be known", "remove it")
         if missing := [name for name in ids if name not in streams]:
-            fields.fault("cameras", "must have each camera", f"no {', '.join(missing)}")
+            fields.fault(
+                "cameras", "must have each camera", f"no {', '.join(missing)}", "add it"
+            )
+        if not Path(PYTHON).exists():
+            fields.fault(
+                "cameras", "are streamed by Aravis", f"no {PYTHON}", aravis.PACKAGES
+            )
         require_none(faults)
         for name in ids:
             make_private(root / name)

@@ -6,12 +6,14 @@ import json
 import re
 import shutil
 import subprocess
+import sys
 
 import numpy as np
 import pytest
 
 from skindb.errors import InputError, SkindbWarning
 from skindb.format.frames import FrameKind, read_frame
+from skindb.hw import streaming
 from skindb.hw.aravis import tiff_head
 from skindb.hw.streaming import PYTHON, STREAMS, StreamingCameras
 
@@ -110,6 +112,19 @@ def test_streaming_cameras__a_wrong_setting_is_one_line(
 ):
     with pytest.raises(InputError, match=said):
         _streams(tmp_path, features, device)
+
+
+@pytest.mark.parametrize(
+    ("python", "said"),
+    [
+        (sys.executable, "found no Aravis for .*apt install gir1.2-aravis"),
+        ("/absent/python3", "found no /absent/python3; Debian: apt install"),
+    ],
+)
+def test_streaming_cameras__say_what_to_install(tmp_path, monkeypatch, python, said):
+    monkeypatch.setattr(streaming, "PYTHON", python)
+    with pytest.raises(InputError, match=said):
+        _streams(tmp_path, SIZE)
 
 
 @pytest.mark.parametrize("camera", [300], indirect=True)  # of 1,000 packets
