@@ -12,6 +12,7 @@ import skindb
 from skindb.cli import _one_line, cli
 from skindb.cli.shared import aligned
 from skindb.cli.terminal import HelpFormatter, Progress, echo
+from skindb.cli.upkeep import _info_lines
 from skindb.errors import SkindbWarning
 
 sys.path.insert(0, str(Path(__file__).parent / "store"))
@@ -79,6 +80,13 @@ def test_aligned__continues_a_wide_table_below_with_its_text_columns():
         "site   channel  count",
         "cheek  R        12",
     ]
+
+
+def test_info__explains_the_star_of_a_take_alone():
+    version = {"generation": 3, "bytes": 0, "created": "2026-01-02T03", "stale": ["x"]}
+    lines = _info_lines(None, {"takes": {"A": {"edit": version}}}, details=False)
+    assert lines[1].split() == ["A", "2026-01-02", "0.0", "3*"]
+    assert lines[2] == "* out of date: skindb refresh computes it again"
 
 
 def test_help__has_a_section_for_each_purpose_and_colour_on_terminals_alone():

@@ -28,7 +28,7 @@ from skindb.cli.population import edit, register, reproduce
 from skindb.cli.shared import echo_json, fault_lines
 from skindb.cli.studies import analyze, tidy
 from skindb.cli.subjects import consent, refresh, release, withdraw
-from skindb.cli.terminal import HelpFormatter, echo
+from skindb.cli.terminal import HelpContext, echo
 from skindb.cli.upkeep import audit, backup, clean, info, restore, verify
 from skindb.errors import Fault, InputError, SkindbWarning, escaped, system_fault
 from skindb.files import private_umask
@@ -57,6 +57,8 @@ SECTIONS = {
 class Commands(click.Group):
     """The commands, which the help lists in sections."""
 
+    context_class = HelpContext
+
     def format_commands(
         self,
         ctx: click.Context,  # noqa: ARG002
@@ -81,9 +83,9 @@ def cli() -> None:
     """
 
 
-click.Context.formatter_class = HelpFormatter
 for _commands in SECTIONS.values():
     for _command in _commands:
+        _command.context_class = HelpContext
         cli.add_command(_command)
 
 

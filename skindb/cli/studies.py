@@ -33,7 +33,7 @@ from skindb.cli.options import (
     options_of,
 )
 from skindb.cli.shared import aligned, cluster, emit, existing, shared_path, writable
-from skindb.cli.terminal import bar
+from skindb.cli.terminal import HelpContext, bar
 from skindb.errors import input_error
 from skindb.files import csv_text, private_file
 
@@ -203,6 +203,7 @@ def _study_command(study: Declaration) -> click.Command:
         run = add(run)
     text = f"Study the {study.description}."
     studying = click.command(study.name, help=text, short_help=study.description)(run)
+    studying.context_class = HelpContext
     studying.params += FURTHER.get(study.name, ())
     options = [option for option in studying.params if option.name != "formula"]
     if len(options) < len(studying.params):

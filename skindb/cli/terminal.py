@@ -42,6 +42,12 @@ def echo(*lines: str, err: bool = False) -> None:
         click.echo(escaped(line), err=err)
 
 
+class HelpContext(click.Context):
+    """The context of a command whose help is in colour."""
+
+    formatter_class = HelpFormatter
+
+
 def terminal_width() -> int:
     """Columns of the terminal; of a file or a pipe, as many as a line has."""
     return get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize

@@ -101,7 +101,9 @@ def _info_lines(database: Database, result: Json, *, details: bool) -> list[str]
     ]
     if rows:
         lines += aligned([["name", "kind", "version", "MB", "created", ""], *rows])
-    if any(cell.endswith("*") for row in rows for cell in row):
+    of_takes = [one for versions in takes.values() for one in versions.values()]
+    of_others = [one for _, versions in others for one in versions.values()]
+    if any(version.get("stale") for version in of_takes + of_others):
         lines.append("* out of date: skindb refresh computes it again")
     used = Counter(
         line
@@ -109,12 +111,7 @@ def _info_lines(database: Database, result: Json, *, details: bool) -> list[str]
         for line in calibrated_by_lines(versions.get("capture", {}))
     )
     lines += [f"{line}: {count} takes" for line, count in used.items()]
-    return lines + [
-        version["fault"]
-        for versions in takes.values()
-        for version in versions.values()
-        if "fault" in version
-    ]
+    return lines + [version["fault"] for version in of_takes if "fault" in version]
 
 
 def _cells(version: Json) -> list[str]:
