@@ -40,8 +40,8 @@ MIN_ALBEDO = 1e-4  # below it, ratios of albedos are meaningless
 MEASURED = (  # differences from skindb render (docs/howto/view.md)
     "half precision of albedo, weights, normals and tables: values differ by at most 0.05 %",
     (
-        "shadow maps of 1,024 texels, and lights as points: pictures of faces differ by 1.3 "
-        "to 3.5 % (measured), those of a simple test surface by 0.4 to 0.7 %"
+        "shadow maps of 1,024 texels, and lights as points: pictures of faces differ by 0.4 "
+        "to 1.1 % (light from the front), 1.2 to 2.3 % (side) and 3.9 to 4.6 % (above)"
     ),
     (
         "light under the skin as one Gaussian in a texture of 384 texels: pictures "
