@@ -71,6 +71,11 @@ def tiff_head(width: int, height: int, pixel_format: str) -> bytes:
     return b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + bytes(4)
 
 
+def counted(frame_id: int, last: int | None) -> int:
+    """Number of a frame that does not begin again; frames may come out of order."""
+    return frame_id + WRAP * round(((last or frame_id) - frame_id) / WRAP)
+
+
 def say(line: str) -> None:
     """Print a line for the parent."""
     sys.stdout.write(f"{line}\n")
@@ -99,14 +104,13 @@ def stream(device: str, folder: Path, features: str) -> None:
     camera.start_acquisition()
     say("armed")
     counts = {"frames": 0, "incomplete": 0}
-    number = turns = 0
+    number = None
     is_open = True
     while is_open or frames.get_n_buffers()[1]:
         buffer = frames.timeout_pop_buffer(WAIT_US)
         if buffer is not None and buffer.get_status() == Aravis.BufferStatus.SUCCESS:
-            turns += buffer.get_frame_id() < number
-            number = buffer.get_frame_id()
-            name = f"{begin}_{number + WRAP * turns:010d}.tif"
+            number = counted(buffer.get_frame_id(), number)
+            name = f"{begin}_{number:010d}.tif"
             head = tiff_head(
                 buffer.get_image_width(), buffer.get_image_height(), pixel_format
             )
@@ -119,14 +123,15 @@ def stream(device: str, folder: Path, features: str) -> None:
         if buffer is not None:
             frames.push_buffer(buffer)
         if is_open and select.select([sys.stdin], [], [], 0)[0]:
-            line = sys.stdin.readline()
-            is_open = bool(line)
+            asked = os.read(sys.stdin.fileno(), 1 << 12)
+            is_open = bool(asked)
             if not is_open:
                 camera.stop_acquisition()
-            elif line == "trigger\n":
-                camera.software_trigger()
-            else:
-                say(json.dumps(counts | _statistics(frames)))
+            for line in asked.split():
+                if line == b"trigger":
+                    camera.software_trigger()
+                else:
+                    say(json.dumps(counts | _statistics(frames)))
 
 
 def _statistics(frames: Any) -> dict[str, int]:

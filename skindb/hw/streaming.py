@@ -67,6 +67,7 @@ class StreamingCameras(FolderCameras):
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 text=True,
+                start_new_session=True,  # Ctrl-C ends the lights, not what cameras send
             )
             for name, (device, features) in streams.items()
             if name in ids

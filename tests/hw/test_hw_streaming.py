@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from skindb.errors import InputError, SkindbWarning
 from skindb.format.frames import FrameKind, read_frame
 from skindb.hw import streaming
-from skindb.hw.aravis import tiff_head
+from skindb.hw.aravis import counted, tiff_head
 from skindb.hw.streaming import PYTHON, STREAMS, StreamingCameras
 
 FAKE = "arv-fake-gv-camera-0.8"
@@ -64,6 +66,19 @@ def _streams(tmp_path, features, device=ADDRESS):
     record = {"cameras": [{"id": "c0", "device": device, "features": features}]}
     (tmp_path / STREAMS).write_text(json.dumps(record))
     return StreamingCameras(tmp_path, ["c0"])
+
+
+@pytest.mark.parametrize("first", [1, 65530, 10**12])
+def test_counted__a_16_bit_number_begins_again_and_frames_may_be_late(first):
+    truth = first + np.array([0, 1, 3, 2, 5, 4, 6, 90, 30_000, 60_000, 59_990, 80_000])
+    last = None
+    found = []
+    for number in truth.tolist():
+        sent = number if first > 1e9 else (number - 1) % 65535 + 1
+        last = counted(sent, last)
+        found.append(last)
+    # the count begins at the number that the camera sent first
+    np.testing.assert_array_equal(np.array(found) - found[0], truth - truth[0])
 
 
 def _numbers(shots):
@@ -161,6 +176,19 @@ def test_streaming_cameras__lost_packets_are_said(camera, tmp_path):
     # only complete ones are kept
     head = len(tiff_head(WIDTH, HEIGHT, "Mono8"))
     assert all(shot.path.stat().st_size == head + WIDTH * HEIGHT for shot in shots)
+
+
+def test_streaming_cameras__lines_that_come_together_are_all_answered(camera, tmp_path):
+    cameras = _streams(tmp_path, f"PixelFormat=Mono8 {SIZE} {TRIGGERED}")
+    try:
+        cameras.start()
+        cameras._tell("trigger\ntrigger")
+        assert cameras.collect(0).keys() == {"c0"}
+        # Ctrl-C reaches the group of this process
+        streaming_process = cameras._processes["c0"]
+        assert os.getpgid(streaming_process.pid) != os.getpgid(0)
+    finally:
+        cameras.close()
 
 
 def test_streaming_cameras__a_camera_that_vanished_is_named(camera, tmp_path):
