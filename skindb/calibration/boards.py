@@ -12,9 +12,9 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from skindb.errors import Fault, input_error, require, require_none
+from skindb.errors import Fault, few_names, require, require_none
 from skindb.format.fields import Fields, read_json
-from skindb.format.frames import CAMERA, filled, read_frame
+from skindb.format.frames import CAMERA, filled, opencv, read_frame
 from skindb.geometry.camera import Pinhole
 from skindb.limits import MAX_BALL_PLACES, MAX_CAMERAS
 from skindb.types import Array, Float64, Index, float64
@@ -25,6 +25,7 @@ MIN_CORNERS = 8  # in a picture
 MIN_POSES = 4  # of a camera; three determine it without a check
 # rms of a camera; OpenCV finds corners to 0.1 px in sharp pictures
 MAX_REPROJECTION_PX = 1.0
+FAR_PX = 1e4  # for points behind a camera, or beyond its distortion
 STEP = 1e-7  # of the finite differences: root of the precision, of at least 1
 OF_CAMERA, OF_POSE = 15, 6  # numbers: fx fy cx cy, distortion, rotation vector, t
 Views = dict[tuple[str, int], tuple[Index, Float64]]  # camera, pose -> corners, pixels
@@ -56,17 +57,9 @@ def read_boards(folder: Path) -> Boards:
     InputError
         If the file is faulty, OpenCV is missing, or a picture cannot be read.
     """
-    try:
-        import cv2
-    except ImportError:
-        raise input_error(
-            str(folder / FILE),
-            "boards are found by OpenCV",
-            "no OpenCV",
-            "pip install 'skindb[cameras]'",
-        ) from None
-    faults = list[Fault]()
     path = folder / FILE
+    cv2 = opencv(path)
+    faults = list[Fault]()
     fields = Fields(read_json(path, faults), str(path), faults)
     template = fields.template("frames", {CAMERA, POSE})
     count = fields.integer("poses", minimum=MIN_POSES, maximum=MAX_BALL_PLACES)
@@ -87,14 +80,19 @@ def read_boards(folder: Path) -> Boards:
     board = cv2.aruco.CharucoBoard(tuple(squares.tolist()), square, marker, dictionary)
     detector = cv2.aruco.CharucoDetector(board)
     views: Views = {}
-    sizes = {}
+    sizes = dict[str, tuple[int, int]]()
     for camera in cameras:
         for pose in range(1, count + 1):
             file = folder / filled(template, camera=camera, pose=str(pose))
             if not file.is_file():
                 continue  # not every camera sees every pose
             frame = float64(read_frame(file)).mean(axis=2)
-            sizes[camera] = (frame.shape[1], frame.shape[0])
+            size = (frame.shape[1], frame.shape[0])
+            if sizes.setdefault(camera, size) != size:
+                rule = "pictures of a camera must have one size"
+                side = f"{size[0]} x {size[1]}"
+                fields.faults.append(Fault(str(file), rule, side, "take it again"))
+                continue
             grey = np.rint(255 * frame / max(frame.max(), 1)).astype(np.uint8)
             pixels, ids = detector.detectBoard(grey)[:2]
             if ids is not None and len(ids) >= MIN_CORNERS:
@@ -103,6 +101,9 @@ def read_boards(folder: Path) -> Boards:
                     np.ravel(ids),
                     float64(pixels).reshape(-1, 2) + 0.5,
                 )
+    for camera in set(cameras) - set(sizes):
+        fields.fault("frames", f"must have pictures of {camera}", "none")
+    require_none(faults)
     middle = squares * square / 2
     found = float64(board.getChessboardCorners())
     corners = np.stack(
@@ -141,7 +142,7 @@ def calibrate_cameras(boards: Boards) -> dict[str, CalibratedCamera]:
         ]
     )
     cameras, poses = _start(boards, poses_of)
-    names, numbers = list(cameras), [pose for pose in poses if pose != min(poses)]
+    names, numbers = list(cameras), [pose for pose in poses if pose != 1]
     x = np.concatenate([*cameras.values(), *(poses[pose] for pose in numbers)])
     parts = {
         name: slice(OF_CAMERA * i, OF_CAMERA * (i + 1)) for i, name in enumerate(names)
@@ -169,7 +170,8 @@ def calibrate_cameras(boards: Boards) -> dict[str, CalibratedCamera]:
             ]
             one = _pinhole(x[parts[name]])
             projected.append(one.project(np.concatenate(points)).ravel())
-        return float64(np.concatenate(projected) - pixels)
+        apart = np.concatenate(projected) - pixels
+        return float64(np.where(np.isfinite(apart), apart, FAR_PX))
 
     def slopes(x: Float64) -> Float64:
         """Finite differences; a row depends on one camera and one pose, so that numbers of
@@ -253,8 +255,7 @@ def _start(
             seen[camera, pose] = _matrix(
                 np.concatenate([np.ravel(turn), np.ravel(shift)])
             )
-    begin = min(pose for _, pose in seen)
-    poses_at = {begin: np.eye(4)}  # from the board to the frame of the first pose
+    poses_at = {1: np.eye(4)}  # from the board to the frame of the first pose
     cameras_at = dict[str, Float64]()  # from that frame to the camera
     order = sorted(seen, key=lambda view: -len(boards.views[view][0]))
     while edges := [v for v in order if (v[0] in cameras_at) != (v[1] in poses_at)]:
@@ -307,6 +308,13 @@ def with_cameras(
 ) -> dict[str, Any]:
     """The content of a dome.json with these cameras: those of the same id keep their other keys."""
     before = {item.get("id"): item for item in record.get("cameras", [])}
+    require(
+        not (others := sorted(set(before) - set(cameras))),
+        "dome.json",
+        "its cameras must all be calibrated, as the result has another frame",
+        f"no pictures of {few_names(others)}",
+        f"add them to {FILE}, or remove them",
+    )
     found = [
         before.get(name, {})
         | {
@@ -320,5 +328,4 @@ def with_cameras(
         }
         for name, one in cameras.items()
     ]
-    others = [item for name, item in before.items() if name not in cameras]
-    return {**record, "cameras": [*found, *others]}
+    return {**record, "cameras": found}

@@ -480,21 +480,24 @@ def _decode_tiff(path: Path, content: bytes) -> Frame:
     return _demosaiced(path, values, pattern, top)
 
 
+def opencv(path: Path) -> Any:
+    """OpenCV, which frames of a colour filter array and pictures of boards need."""
+    try:
+        import cv2
+    except ImportError:
+        raise input_error(
+            str(path), "is read by OpenCV", "no OpenCV", "pip install 'skindb[cameras]'"
+        ) from None
+    return cv2
+
+
 def _demosaiced(path: Path, values: AnyArray, pattern: str, top: int) -> Frame:
     """Bilinear interpolation (h, w, 3) of sensor values (h, w) behind colour filters.
 
     Pixels beside one that has the value `top` are saturated, too, as their mean would be
     too small.
     """
-    try:
-        import cv2
-    except ImportError:
-        raise input_error(
-            str(path),
-            "frames of a colour filter array are interpolated by OpenCV",
-            "no OpenCV",
-            "pip install 'skindb[cameras]'",
-        ) from None
+    cv2 = opencv(path)
     try:
         frame = cv2.demosaicing(values, getattr(cv2, f"COLOR_Bayer{pattern}2RGB"))
         near = cv2.dilate(np.asarray(values >= top, np.uint8), np.ones((3, 3)))

@@ -16,6 +16,7 @@ from skindb.calibration.boards import (
     _pinhole,
     calibrate_cameras,
     read_boards,
+    with_cameras,
 )
 from skindb.cli import cli
 from skindb.errors import InputError
@@ -122,6 +123,19 @@ def test_calibrate_cameras__names_what_is_missing():
     assert len(error.value.faults) == 2
 
 
+def test_calibrate_cameras__the_first_pose_must_be_seen():
+    boards = planted(5)
+    later = {view: seen for view, seen in boards.views.items() if view[1] > 1}
+    with pytest.raises(InputError, match="must see the first pose"):
+        calibrate_cameras(replace(boards, views=later))
+
+
+def test_with_cameras__refuses_cameras_that_stay_in_another_frame():
+    record = {"cameras": [{"id": "c0"}, {"id": "c9"}]}
+    with pytest.raises(InputError, match="found no pictures of c9"):
+        with_cameras(record, planted(5), dict.fromkeys(TRUTH))
+
+
 def _draw(folder):
     """Pictures of a board by three cameras without distortion, as homographies of the board."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
@@ -202,6 +216,7 @@ def test_calibrate_cameras__from_pictures_to_a_dome(tmp_path):
         ({"dictionary": "DICT_9"}, "must be one of OpenCV; found DICT_9"),
         ({"frames": "board.png"}, "must name {camera} and {pose}"),
         ({"cameras": []}, "at least one name"),
+        ({}, "must have pictures of c0; found none"),
     ],
 )
 def test_read_boards__wrong_values_are_one_line(tmp_path, changed, said):

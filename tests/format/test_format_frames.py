@@ -254,31 +254,20 @@ def test_read_frame__of_a_colour_filter_array_needs_opencv(tmp_path, monkeypatch
 
 
 @pytest.mark.slow
-def test_read_frame__no_change_of_a_raw_header_is_an_internal_error(tmp_path):
-    _raw(tmp_path / "a.tif", np.full((6, 8, 3), 9), "RG")
-    content = (tmp_path / "a.tif").read_bytes()
-    for place in range(len(content) - 96):
-        for value in (0, 1, 2, 255):
-            damaged = bytearray(content)
-            damaged[place] = value
-            (tmp_path / "a.tif").write_bytes(damaged)
-            header_faults(tmp_path / "a.tif", FrameKind(8, 6, 12), "frames")
-            with contextlib.suppress(InputError):
-                read_frame(tmp_path / "a.tif")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("compression", ["zstd", "zlib", None])
+@pytest.mark.parametrize("compression", ["zstd", "zlib", None, "raw"])
 def test_read_frame__no_change_of_a_tiff_header_is_an_internal_error(
     tmp_path, compression
 ):
     """Nor does the message contain one of the library, whose text depends on the damage."""
-    tifffile.imwrite(
-        tmp_path / "a.tif",
-        FRAMES["a16.png"][0],
-        photometric="rgb",
-        compression=compression,
-    )
+    if compression == "raw":
+        _raw(tmp_path / "a.tif", FRAMES["a16.png"][0], "RG")
+    else:
+        tifffile.imwrite(
+            tmp_path / "a.tif",
+            FRAMES["a16.png"][0],
+            photometric="rgb",
+            compression=compression,
+        )
     content = (tmp_path / "a.tif").read_bytes()
     said = set()
     for place in range(len(content)):
