@@ -179,7 +179,7 @@ def suggest_landmarks(
     names = [name for name in MEAN_FACE if name not in fixed]
     if not names:
         return {}
-    if _determine_rotation(fixed):
+    if determine_rotation(fixed):
         guess = _fitted(fixed) | _mirrored(fixed)
     else:
         start = {NOSE: nose_tip(vertices), **fixed}
@@ -192,7 +192,7 @@ def suggest_landmarks(
     return dict(zip(names, nearest, strict=True))
 
 
-def _determine_rotation(points: Mapping[str, Array]) -> bool:
+def determine_rotation(points: Mapping[str, Array]) -> bool:
     """Whether points determine the rotation of the head."""
     return len(points) > 2 and width(np.array([*points.values()])) > MIN_WIDTH
 
@@ -204,7 +204,7 @@ def _fitted(points: Points) -> Points:
     mean = np.array([*MEAN_FACE.values()])
     source = np.array([MEAN_FACE[name] for name in points])
     target = np.array([*points.values()])
-    if _determine_rotation(points):
+    if determine_rotation(points):
         matrix, shift = similarity(source, target)
     else:
         matrix = np.eye(3)
@@ -217,7 +217,7 @@ def _mirrored(points: Points) -> Points:
     the others onto their mates.
     """
     both = {name: p for name, p in points.items() if mate(name) in points}
-    if not _determine_rotation(both):
+    if not determine_rotation(both):
         return {}
     flip = np.array([-1.0, 1, 1])
     source = np.array([points[mate(name)] for name in both]) * flip

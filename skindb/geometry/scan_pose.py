@@ -13,10 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from skindb.errors import few_names, require
 from skindb.geometry.camera import Pinhole
-from skindb.geometry.landmarks import similarity
+from skindb.geometry.landmarks import determine_rotation, similarity
 from skindb.types import Array, Float64, float64
 
-MIN_POINTS = 3  # seen by two cameras each
 UNITS = {"mm": 1.0, "cm": 10.0, "inch": 25.4, "m": 1000.0}
 # Relative difference of a measured scale from that of a unit. Points that are set to 1 mm
 # on a face of 150 mm give 1 %; units differ by 150 % and more.
@@ -65,17 +64,17 @@ def scan_pose(
     Raises
     ------
     InputError
-        If fewer than three points are seen by two cameras, or the scan would have no
-        known unit.
+        If the points that two cameras see are fewer than three or in a line, or the scan
+        would have no known unit.
     """
     by_point = dict[str, list[str]]()
     for camera, name in seen:
         by_point.setdefault(name, []).append(camera)
     common = [name for name, by in by_point.items() if len(by) > 1 and name in points]
     require(
-        len(common) >= MIN_POINTS,
+        determine_rotation({name: points[name] for name in common}),
         "points in photographs",
-        f"{MIN_POINTS} points of the scan must be seen by two cameras each",
+        "three points of the scan that are not in a line must be seen by two cameras each",
         few_names(common) or "none",
         "mark more points",
     )

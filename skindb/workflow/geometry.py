@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from skindb.calibration.boards import calibrate_cameras as boards_to_cameras
 from skindb.calibration.boards import read_boards, with_cameras
 from skindb.calibration.setup import read_setup_dome
-from skindb.errors import Fault, require, require_none
+from skindb.errors import Fault, choices, require, require_none
 from skindb.files import Json, make_private, private_file
 from skindb.format.fields import Fields, read_json
 from skindb.format.folder import read_capture
@@ -33,6 +33,8 @@ ROUNDS = (
 CHECK = IngestParameters(
     spacing_mm=4.0, photographs=0, calibration="note", refine=False
 )
+# folder inside the capture, so that what a killed run leaves is deleted with it
+LINKS = ".scan-"
 KEYS = ("mesh", "landmarks")  # of capture.json
 FILES = ("scan.ply", "landmarks.json")
 
@@ -131,13 +133,17 @@ def register_scan(
         item = fields.object(camera)
         if camera not in dome.camera_ids:
             fields.fault(camera, "must be a camera of the dome", camera)
+        for name in set(item.data) - set(points):
+            item.fault(
+                name, "must be a landmark of the scan", name, choices(name, points)
+            )
         pixels |= {(camera, name): item.array(name, (2,)) for name in item.data}
     require_none(faults)
     mesh = read_scan(scan)
     pose = scan_pose(points, pixels, {camera.id: camera for camera in dome.cameras})
     matrix = pose.matrix
     shift = turn = None
-    with tempfile.TemporaryDirectory(dir=capture.parent, prefix=".scan-") as folder:
+    with tempfile.TemporaryDirectory(dir=capture, prefix=LINKS) as folder:
         copy = Path(folder) / "capture"
         for file in _without_scan(capture):
             target = copy / file.relative_to(capture)
@@ -191,7 +197,9 @@ def _without_scan(capture: Path) -> list[Path]:
     return [
         file
         for file in capture.rglob("*")
-        if file.is_file() and str(file.relative_to(capture)) not in names
+        if file.is_file()
+        and not (relative := str(file.relative_to(capture))).startswith(LINKS)
+        and relative not in names
     ]
 
 

@@ -74,6 +74,14 @@ def test_scan_pose__refuses_what_does_not_determine_it():
     two = {name: scan[name] for name in ("chin", "nasion")}
     with pytest.raises(InputError, match="must be seen by two cameras each; found "):
         scan_pose(two, seen, CAMERAS)
+    line = {"a": (0.0, 0.0, 0.0), "b": (0.0, 50.0, 1.0), "c": (0.0, 99.0, 2.0)}
+    on_line = {
+        (name, point): one.project(np.array(line[point]))
+        for name, one in CAMERAS.items()
+        for point in line
+    }
+    with pytest.raises(InputError, match="not in a line"):
+        scan_pose({name: np.array(p) for name, p in line.items()}, on_line, CAMERAS)
     alone = {key: pixel for key, pixel in seen.items() if key[0] == "c0"}
     with pytest.raises(InputError, match="found none; mark more points"):
         scan_pose(scan, alone, CAMERAS)

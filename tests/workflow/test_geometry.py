@@ -83,7 +83,8 @@ def test_register_scan__wrong_files_are_one_line(laboratory, tmp_path):
         ({"c99": {"chin": [1, 2]}}, "must be a camera of the dome; found c99"),
         ({"c00": {"chin": [1, 2, 3]}}, "must be 2 numbers"),
         ({"c00": 5}, "must be a JSON object"),
-        ({}, "3 points of the scan must be seen by two cameras each; found none"),
+        ({"c00": {"nose_tp": [1, 2]}}, "found nose_tp; did you mean nose_tip"),
+        ({}, "three points of the scan .* seen by two cameras each; found none"),
     ):
         (tmp_path / "seen.json").write_text(json.dumps(seen))
         with pytest.raises(InputError, match=said):
