@@ -4,18 +4,16 @@ A version is current if it was derived from the same inputs, with the same param
 by the same code. This is decided here for models, registrations, summaries, studies
 and edits.
 
-The digest of the code covers the functions that are named and everything in skindb that
-they use: functions, classes and constants, followed through the imports of their modules.
-The source is parsed and never imported. Docstrings, comments, annotations, help texts of
-parameters and formatting do not count, nor does what stands in the same file and is not
-used. A table (a JSON file) beside a module counts where it is named.
+The digest of the code covers the modules of the functions that are named, and all modules
+of skindb that these import, directly or through others. The source is parsed and never
+imported. Docstrings, comments, annotations, help texts of parameters and formatting do not
+count. A table (a JSON file) beside a module counts where it is named.
 """
 
 from __future__ import annotations
 
 import ast
 import hashlib
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache, partial
@@ -30,9 +28,9 @@ from skindb.files import ROOT, package_digest, plain
 from skindb.store import STUDY, SUMMARY, Database, Lease, Record
 
 PACKAGE = "skindb"
-# The store returns what was committed, and the version of the schema, which every
-# version records, stands for the table of variables
-NOT_FOLLOWED = ("skindb.store.", "skindb.schema.variables.")
+# The store and the workflow read and commit what was computed, and the version of the
+# schema, which every version records, stands for the table of variables
+NOT_FOLLOWED = ("skindb.store.", "skindb.workflow.", "skindb.schema.variables.")
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 # fields of syntax trees that follow from others or do not change what is computed
 DERIVED_FIELDS = ("ctx", "kind", "type_comment", "type_params")
@@ -41,9 +39,6 @@ ANNOTATIONS: dict[type[ast.AST], str] = {
     ast.AsyncFunctionDef: "returns",
     ast.arg: "annotation",
 }
-
-Symbol = tuple[str, str]  # module and name
-Reference = tuple[str, tuple[str, ...]]  # module and dotted names
 COMMANDS = {
     "model": "fit",
     "registration": "register",
@@ -55,40 +50,39 @@ TABLES = "tables"  # group that is kept beside a version, for cohorts
 
 
 def code_digest(*functions: Callable[..., Any]) -> str:
-    """Digest of the source of functions and of all code of skindb that they use.
+    """Digest of the modules of functions, and of all modules of skindb that these import.
 
     Parameters
     ----------
     *functions
-        Functions or classes of skindb. A function that is defined inside another one
-        counts as the outer one; of a `functools.partial` the function is taken.
+        Functions or classes of skindb; of a `functools.partial` the function is taken.
 
     Raises
     ------
     ValueError
         If a function is not part of skindb.
     """
-    return _digest_of(ROOT, tuple(_symbol(function) for function in functions))
+    return _digest_of(ROOT, tuple(_module_of(function) for function in functions))
 
 
-def _symbol(function: Callable[..., Any]) -> Symbol:
+def _module_of(function: Callable[..., Any]) -> str:
     while isinstance(function, partial):
         function = function.func
     module = function.__module__
-    name = function.__qualname__.partition(".")[0]
     if module.partition(".")[0] != PACKAGE:
-        raise ValueError(f"{module}.{name} must be a function of {PACKAGE}")
-    return module, name
+        name = f"{module}.{function.__qualname__}"
+        raise ValueError(f"{name} must be a function of {PACKAGE}")
+    return module
 
 
 @cache
-def _digest_of(root: Path, starts: tuple[Symbol, ...]) -> str:
+def _digest_of(root: Path, starts: tuple[str, ...]) -> str:
     """From the cache on disk while no file of the package changes, as parsing takes a second."""
     # modules may have been parsed before an edit, in a notebook
     if package_digest.__wrapped__(root) != package_digest(root):
         return _parsed_digest(root, starts)
     stored = cached_arrays(
-        f"code-{starts[0][1]}",
+        f"code-{starts[0]}",
         (starts, package_digest(root)),
         sources=(__name__,),
         make=lambda: {"digest": np.array([_parsed_digest(root, starts)])},
@@ -96,157 +90,66 @@ def _digest_of(root: Path, starts: tuple[Symbol, ...]) -> str:
     return str(stored["digest"][0])
 
 
-def _parsed_digest(root: Path, starts: tuple[Symbol, ...]) -> str:
+def _parsed_digest(root: Path, starts: tuple[str, ...]) -> str:
     digest = hashlib.sha256()
-    for module, name in sorted(_reached(root, starts)):
-        digest.update(f"{module}:{name}\n".encode())
-        for statement in _source(root, module).statements(name):
-            digest.update(repr(_written(statement)).encode())
-            for table in _tables(root, module, statement):
-                digest.update(table.read_bytes())
+    for module, tree in sorted(_reached(root, starts).items()):
+        digest.update(f"{module}\n{_written(tree)!r}".encode())
+        for table in _tables(root, module, tree):
+            digest.update(table.read_bytes())
     return digest.hexdigest()
 
 
-def _tables(root: Path, module: str, statement: ast.stmt) -> Iterator[Path]:
-    """Tables beside a module that a statement names."""
+def _reached(root: Path, starts: Iterable[str]) -> dict[str, ast.Module]:
+    """Syntax trees of modules and of those that they import."""
+    trees: dict[str, ast.Module] = {}
+    pending = list(starts)
+    while pending:
+        module = pending.pop()
+        path = _path(root, module)
+        if path is not None and module not in trees:
+            trees[module] = _parsed(path)
+            imported = _imported(root, module, trees[module])
+            pending += [x for x in imported if not f"{x}.".startswith(NOT_FOLLOWED)]
+    return trees
+
+
+@cache
+def _parsed(path: Path) -> ast.Module:
+    """Syntax tree of a module and of its stub of lazy imports, without docstrings."""
+    tree = ast.parse(path.read_bytes(), path.name)
+    stub = path.with_suffix(".pyi")
+    if stub.is_file():
+        tree.body += ast.parse(stub.read_bytes()).body
+    for node in ast.walk(tree):
+        if isinstance(node, DOCUMENTED) and ast.get_docstring(node, clean=False):
+            del node.body[0]
+    return tree
+
+
+def _imported(root: Path, package: str, tree: ast.Module) -> Iterator[str]:
+    """Modules that a module or package imports."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            source = f"{package}.{node.module}" if node.level else str(node.module)
+            for alias in node.names:
+                name = f"{source}.{alias.name}"
+                yield source if _path(root, name) is None else name
+
+
+def _tables(root: Path, module: str, tree: ast.Module) -> Iterator[Path]:
+    """Tables beside a module that it names."""
     path = _path(root, module)
-    for node in ast.walk(statement):
+    for node in ast.walk(tree):
         if (
-            isinstance(node, ast.Constant)
+            path
+            and isinstance(node, ast.Constant)
             and str(node.value).endswith(".json")
-            and path
         ):
             table = path.with_name(str(node.value))
             if table.is_file():
                 yield table
-
-
-def _reached(root: Path, starts: Iterable[Symbol]) -> set[Symbol]:
-    """The definitions that some definitions use, and these themselves."""
-    symbols: set[Symbol] = set()
-    references = set()
-    pending: list[Reference] = [(module, (name,)) for module, name in starts]
-    while pending:
-        reference = pending.pop()
-        if reference not in references:
-            references.add(reference)
-            pending += _followed(root, *reference, symbols)
-    return symbols
-
-
-def _followed(
-    root: Path, module: str, names: tuple[str, ...], symbols: set[Symbol]
-) -> list[Reference]:
-    """What dotted names in a module lead to; a definition is added to `symbols`."""
-    if f"{module}.".startswith(NOT_FOLLOWED):
-        return []
-    source = _source(root, module)
-    if not names:  # the module itself
-        return [(module, (name,)) for name in (*source.definitions, *source.imports)]
-    name, *attributes = names
-    followed: list[Reference] = []
-    if name in source.definitions and (module, name) not in symbols:
-        symbols.add((module, name))
-        statements = source.statements(name)
-        followed += [(module, chain) for node in statements for chain in _chains(node)]
-    for target, path in source.imports.get(name, ()):
-        followed.append((target, (*path, *attributes)))
-    if name not in source.imports and _path(root, f"{module}.{name}") is not None:
-        followed.append((f"{module}.{name}", tuple(attributes)))
-    return followed
-
-
-@dataclass
-class _Source:
-    """What the names in a module stand for."""
-
-    definitions: dict[str, list[ast.stmt]]
-    imports: dict[str, list[Reference]]
-    # statements that bind no name: they may change what the others are
-    effects: list[ast.stmt]
-
-    def statements(self, name: str) -> list[ast.stmt]:
-        """The statements that define a name."""
-        return [*self.definitions[name], *self.effects]
-
-
-@cache
-def _source(root: Path, module: str) -> _Source:
-    source = _Source(defaultdict(list), defaultdict(list), [])
-    path = _path(root, module)
-    if path is None:
-        return source
-    tree = ast.parse(path.read_bytes(), path.name)
-    # names that a package imports at their first use are listed in its stub
-    stub = path.with_suffix(".pyi")
-    lazy = ast.parse(stub.read_bytes()) if stub.is_file() else ast.Module([], [])
-    for node in (*ast.walk(tree), *ast.walk(lazy)):
-        if isinstance(node, ast.Import | ast.ImportFrom):
-            for name, target in _imported(node, module):
-                is_own = target == (module, (name,))
-                if target[0].partition(".")[0] == PACKAGE and not is_own:
-                    source.imports[name].append(target)
-        if isinstance(node, DOCUMENTED) and ast.get_docstring(node, clean=False):
-            del node.body[0]
-    for statement in tree.body:
-        names = _defined(statement)
-        for name in names:
-            source.definitions[name].append(statement)
-        is_import = isinstance(statement, ast.Import | ast.ImportFrom)
-        if not names and not is_import and not _is_for_types(statement):
-            source.effects.append(statement)
-    return source
-
-
-def _imported(
-    node: ast.Import | ast.ImportFrom, package: str
-) -> Iterator[tuple[str, Reference]]:
-    """Names that an import in a module or package binds, and what they stand for."""
-    for alias in node.names:
-        if isinstance(node, ast.ImportFrom):
-            source = f"{package}.{node.module}" if node.level else str(node.module)
-            yield alias.asname or alias.name, (source, (alias.name,))
-        elif alias.asname:
-            yield alias.asname, (alias.name, ())
-        else:
-            name = alias.name.partition(".")[0]
-            yield name, (name, ())
-
-
-def _defined(statement: ast.stmt) -> set[str]:
-    """Names that a statement of a module binds or changes."""
-    if not isinstance(statement, DOCUMENTED):
-        nodes = [node for node in ast.walk(statement) if isinstance(node, ast.Name)]
-        return {node.id for node in nodes if isinstance(node.ctx, ast.Store)}
-    assert not isinstance(statement, ast.Module)
-    # `@overload(function)` changes what `function` is
-    calls = [call for call in statement.decorator_list if isinstance(call, ast.Call)]
-    arguments = [argument for call in calls for argument in call.args]
-    changed = {node.id for node in arguments if isinstance(node, ast.Name)}
-    return {statement.name} | changed
-
-
-def _is_for_types(statement: ast.stmt) -> bool:
-    """Whether it is `if TYPE_CHECKING`. What is imported there are the names that
-    annotations use, or that a package imports at their first use.
-    """
-    return isinstance(statement, ast.If) and "TYPE_CHECKING" in ast.dump(statement.test)
-
-
-def _chains(node: ast.AST) -> Iterator[tuple[str, ...]]:
-    """The dotted names in a statement, also in annotations: the class of a parameter
-    is code that the function uses.
-    """
-    names = []
-    part = node
-    while isinstance(part, ast.Attribute):
-        names.append(part.attr)
-        part = part.value
-    if isinstance(part, ast.Name):
-        yield (part.id, *reversed(names))
-        return
-    for child in ast.iter_child_nodes(part):
-        yield from _chains(child)
 
 
 def _written(node: Any) -> Any:
@@ -269,7 +172,11 @@ def _written(node: Any) -> Any:
 
 @cache
 def _path(root: Path, module: str) -> Path | None:
-    base = root.joinpath(*module.split(".")[1:])
+    """File of a module of skindb; None for modules of other packages and other names."""
+    package, *names = module.split(".")
+    if package != PACKAGE:
+        return None
+    base = root.joinpath(*names)
     candidates = [base / "__init__.py", base.with_suffix(".py")]
     return next((path for path in candidates if path.is_file()), None)
 
