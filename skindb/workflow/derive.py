@@ -147,7 +147,7 @@ def _tables(root: Path, module: str, tree: ast.Module) -> Iterator[Path]:
             and isinstance(node, ast.Constant)
             and str(node.value).endswith(".json")
         ):
-            table = path.with_name(str(node.value))
+            table = path.parent / str(node.value)
             if table.is_file():
                 yield table
 

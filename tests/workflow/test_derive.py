@@ -46,6 +46,7 @@ from skindb.science.parameters import Parameters
 
 SCALE = 2.0
 TABLE = "table.json"
+NAMED = "dome/other.json"
 
 def fit(values: np.ndarray, parameters: Parameters) -> np.ndarray:
     """Fit values."""
