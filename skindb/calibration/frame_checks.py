@@ -1,10 +1,8 @@
-"""Sanity checks of frames: exchanged exposures, dark frames that are not dark or not of
-their camera, wrong levels, blank pictures.
+"""Sanity checks of frames: exchanged exposures, dark frames that are not dark, wrong
+levels, blank pictures.
 """
 
-import threading
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -23,8 +21,7 @@ from skindb.format.dome import DomeRecord
 from skindb.format.fields import MAX_MAGNITUDE
 from skindb.format.frames import Digests, Frame, read_frame
 from skindb.format.sensor import SensorRecord
-from skindb.numerics.statistics import correlation, robust_deviation
-from skindb.types import Float32, Float64, Index, Mask
+from skindb.types import Float32, Float64, Mask
 
 # of a frame, evenly spread: takes 1 % of the time to decode 10 megapixels
 MAX_COMPARED_PIXELS = 40_000
@@ -60,19 +57,6 @@ MAX_ABOVE_WHITE = 1.25
 MIN_USED_RANGE = 0.02  # of the range of values, by the brightest photograph of a camera
 # of the pixels of linear radiance; of noise around zero, half are positive
 MIN_POSITIVE_FRACTION = 0.01
-# of a camera that are averaged; more reduce noise that is already below the pattern
-MAX_PHOTOGRAPHS = 12
-MAX_PATTERN_PIXELS = 250_000  # in whole rows, evenly spread over the picture
-MIN_PATTERN_PIXELS = 1_000
-# of the pixels, by their mean value: the noise of light hides the pattern in the others
-DARK_QUANTILE = 0.25
-# robust standard deviations, beyond which hot pixels and edges of the pattern are clipped
-MAX_PATTERN_DEVIATIONS = 3.0
-# standard deviations of the correlations with shifted frames, which are unrelated
-MIN_CORRELATION = 6.0
-SHIFTS = 16
-# to the correlation as given; a pattern of columns is the same upside down
-MIN_CORRELATION_RATIO = 2.0
 
 
 def view_faults(
@@ -427,133 +411,3 @@ def _thinned(frame: Frame) -> Frame:
     """At most `MAX_COMPARED_PIXELS` pixels of a frame, evenly spread."""
     step = int(np.ceil(np.sqrt(frame.shape[0] * frame.shape[1] / MAX_COMPARED_PIXELS)))
     return np.ascontiguousarray(frame[::step, ::step])
-
-
-class SensorPatterns:
-    """Mean photograph of each camera that has dark frames without `dark_faults`, whose
-    fixed pattern shows whether they are those of this camera, turned as it is.
-
-    The pattern differs from pixel to pixel, so that even a small part of it is enough.
-    Compared is the shortest exposure, in which the least light hides the pattern.
-    """
-
-    def __init__(self, dome: DomeRecord, mergers: Mapping[str, FrameMerger]) -> None:
-        self._dome = dome
-        self._mergers = mergers
-        step = -(-len(dome.lights) // MAX_PHOTOGRAPHS)
-        # (light, camera) of the photographs
-        self.pairs = frozenset(
-            (j, c)
-            for c, camera in enumerate(dome.cameras)
-            for j in range(0, len(dome.lights), step)
-            if mergers[camera.id].dark is not None
-            and not dark_faults(dome, mergers[camera.id])
-        )
-        self._added = set[tuple[int, int]]()
-        self._total = dict[str, Float32]()
-        self._guard = threading.Lock()
-
-    def add(self, light: int, camera: int, frames: Sequence[Frame]) -> None:
-        """Add the exposures of one view, if it is one of `pairs`."""
-        if (light, camera) not in self.pairs:
-            return
-        name = self._dome.cameras[camera].id
-        frame = frames[int(np.argmin(self._mergers[name].seconds))]
-        # a sum of integers that single precision holds, in any order
-        photograph = frame[:: _pattern_step(frame)].astype(np.float32)
-        with self._guard:
-            self._added.add((light, camera))
-            self._total[name] = self._total.get(name, np.float32(0)) + photograph
-
-    def faults(self, views: Iterable[tuple[int, int]], pool: Executor) -> list[Fault]:
-        """Faults of dark frames that match the photographs of their camera only turned,
-        or are those of another camera.
-
-        Photographs of these views (light, camera) that were not added are read.
-
-        Raises
-        ------
-        InputError
-            If a photograph cannot be decoded.
-        """
-        for j, c in sorted(self.pairs.intersection(views) - self._added):
-            camera = self._dome.cameras[c]
-            self.add(j, c, read_view(self._dome, self._dome.lights[j].id, camera))
-        faults = list(pool.map(self._fault, sorted(self._total)))
-        self._total.clear()  # 3 MB a camera
-        return [fault for fault in faults if fault is not None]
-
-    def _fault(self, camera: str) -> Fault | None:
-        shortest = int(np.argmin(self._mergers[camera].seconds))
-        dark = self._mergers[camera].dark
-        assert dark is not None
-        count = sum(self._dome.cameras[c].id == camera for _, c in self._added)
-        mean = self._total[camera] / np.float32(count)
-        chosen = np.zeros(mean.shape, bool)
-        inner = mean[:, 1:-1]
-        chosen[:, 1:-1] = inner <= np.quantile(inner, DARK_QUANTILE)
-        places = np.flatnonzero(chosen)
-        if len(places) < MIN_PATTERN_PIXELS:
-            return None
-        pattern = _pattern(mean, places)
-
-        def agreement(frame: Frame) -> float:
-            return correlation(pattern, _pattern(frame, places))
-
-        # neighbouring pixels may share noise, for example by the interpolation of colours
-        step = _pattern_step(dark[shortest])
-        thinned = dark[shortest, ::step]
-        unrelated = [
-            agreement(np.roll(thinned, (5 * i, 7 * i), axis=(0, 1)))
-            for i in range(1, SHIFTS + 1)
-        ]
-        spread = max(float(np.std(unrelated)), 1 / np.sqrt(len(pattern)))
-        minimum = max(
-            MIN_CORRELATION * spread, MIN_CORRELATION_RATIO * agreement(thinned)
-        )
-        for finding, frame in _alternatives(camera, self._mergers, shortest):
-            if agreement(frame[::step]) > minimum:
-                return Fault(
-                    f"{self._dome.file}[dark]",
-                    "dark frames must show the pattern of the sensor where the "
-                    "photographs show it",
-                    f"camera {camera}: {finding}",
-                    "write them like the photographs: in the same orientation, under "
-                    "the id of their camera",
-                )
-        return None
-
-
-def _pattern_step(frame: Frame) -> int:
-    """Distance of the rows of a frame that are compared."""
-    return int(np.ceil(frame.shape[0] * frame.shape[1] / MAX_PATTERN_PIXELS))
-
-
-def _alternatives(
-    camera: str, mergers: Mapping[str, FrameMerger], exposure: int
-) -> Iterator[tuple[str, Frame]]:
-    """What the dark frames of a camera may be instead, each with the frame that would
-    then be the right one.
-    """
-    dark = mergers[camera].dark
-    assert dark is not None
-    yield "they look upside down", dark[exposure][::-1, ::-1]
-    yield "they look mirrored", dark[exposure][:, ::-1]
-    yield "they look mirrored top to bottom", dark[exposure][::-1]
-    for name, merger in mergers.items():
-        other_dark = merger.dark
-        if name != camera and other_dark is not None and other_dark.shape == dark.shape:
-            yield f"those of camera {name} match its photographs", other_dark[exposure]
-
-
-def _pattern(frame: Frame | Float32, places: Index) -> Float32:
-    """Differences (n,) of values (h, w, 3) at flat indices (n,) from both neighbours in
-    their row, without outliers.
-    """
-    values = frame.reshape(-1)
-    left, middle, right = (
-        values[places + shift].astype(np.float32) for shift in (-3, 0, 3)
-    )
-    difference = middle - (left + right) / 2
-    limit = MAX_PATTERN_DEVIATIONS * robust_deviation(difference)
-    return np.clip(difference, -limit, limit)

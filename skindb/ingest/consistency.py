@@ -4,7 +4,7 @@ the lights by the shading.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,7 +12,6 @@ import numpy as np
 
 from skindb.calibration.irradiance import light_falloff
 from skindb.format.dome import CameraRecord, DomeRecord
-from skindb.geometry.camera import project
 from skindb.ingest.photo_offsets import (
     Brightness,
     Offset,
@@ -29,7 +28,7 @@ from skindb.ingest.photo_offsets import (
 )
 from skindb.ingest.surfels import SurfelSet
 from skindb.numerics.statistics import correlation
-from skindb.types import Float32, Float64, Half, Index, Mask, dots, finite_rows, float64
+from skindb.types import Float32, Float64, Half, Index, Mask, dots, float64
 
 Pair = tuple[int, int]  # light, camera
 LIGHTS_PER_CAMERA = 3  # those that illuminate the largest part of what the camera sees
@@ -51,9 +50,6 @@ MIN_SEEN_FRACTION = 0.1
 ALBEDO_ROUNDS = 2
 MIN_AGREEMENT = 0.7  # correlation of the square roots of photograph and prediction
 MAX_OFFSET_MM = 10.0  # mm on the face, a tenth of a head's radius
-# gain in correlation, and correlation, from which another explanation is named
-BETTER_AGREEMENT = 0.1
-GOOD_AGREEMENT = 0.8
 
 
 @dataclass(frozen=True)
@@ -75,7 +71,6 @@ class Calibration:
     # (camera,) mm of the offset that the pose of the scan does not explain
     camera_residual: Float64
     brightness: Brightness  # of the photographs, relative to a matte face
-    explanations: Mapping[int, str]  # by camera, a likely cause of its mismatch
 
 
 @dataclass(frozen=True)
@@ -158,9 +153,6 @@ class CalibrationCheck:
         light_agreement = np.diagonal(table).copy()
         np.fill_diagonal(table, -1.0)
         similar = np.nan_to_num(table, nan=-1.0).argmax(axis=1)
-        explanations = {
-            c: self._explanation(c, views, offsets[c], albedo) for c in wrong
-        }
         translation, rotation, residual = self._scan_pose(good)
         return Calibration(
             camera_agreement=agreement,
@@ -173,7 +165,6 @@ class CalibrationCheck:
             scan_rotation=rotation,
             camera_residual=residual,
             brightness=self._brightness(good_views, pictures, offsets, albedo),
-            explanations={c: text for c, text in explanations.items() if text},
         )
 
     def good_offsets(
@@ -327,68 +318,6 @@ class CalibrationCheck:
             if not row[view.light] <= table[view.light, view.light]:
                 table[view.light] = row
         return table
-
-    def _explanation(
-        self, camera: int, views: Sequence[ReducedView], offset: Offset, albedo: Float64
-    ) -> str:
-        """Exchange of pictures or parameters that explains the photographs of a camera;
-        empty if none does.
-        """
-        camera_views = [view for view in views if view.camera == camera]
-        best = max(offset.agreement + BETTER_AGREEMENT, GOOD_AGREEMENT)
-        explanation = ""
-        for text, pixels, clear in self._alternatives(camera):
-            if clear.sum() < MIN_SURFELS:
-                continue
-            exchanged = [
-                replace(view, pixels=pixels, clear=clear) for view in camera_views
-            ]
-            exchanged_offset = camera_offset(exchanged, self.irradiance, albedo)
-            near = exchanged_offset.length * self._mm(camera) < MAX_OFFSET_MM
-            if exchanged_offset.agreement > best and near:
-                best = exchanged_offset.agreement
-                explanation = text
-        return explanation
-
-    def _alternatives(self, c: int) -> Iterator[tuple[str, Float64, Mask]]:
-        """Possible exchanges, each with the pixels (n, 2) and the visibility (n,) of
-        the surfels that it implies.
-        """
-        camera = self.dome.cameras[c]
-        factor = self.factor(c)
-        pixels = self._reduced_pixels(c)
-        clear = self._clear[:, c]
-        size = np.array([camera.width, camera.height]) / factor
-        upside_down = size - pixels
-        mirrored = np.stack([upside_down[:, 0], pixels[:, 1]], axis=1)
-        flipped = np.stack([pixels[:, 0], upside_down[:, 1]], axis=1)
-        yield "they look upside down", upside_down, clear
-        yield "they look mirrored", mirrored, clear
-        yield "they look mirrored top to bottom", flipped, clear
-        for k, other_camera in enumerate(self.dome.cameras):
-            if k != c and (other_camera.width, other_camera.height) == (
-                camera.width,
-                camera.height,
-            ):
-                theirs = float64(self.pixels[self.compared, k]) / factor
-                text = f"they look as if camera {other_camera.id} had taken them"
-                yield text, theirs, self._clear[:, k]
-        middle = camera.K[:2, 2] / factor
-        away = pixels - middle
-        yield "the focal length looks twice too long", middle + away / 2, clear
-        text = "the focal length looks half of what it should be"
-        yield text, middle + away * 2, clear
-        turned = replace(camera, R=camera.R.T)
-        turned_pixels, depth = project(
-            self._position, turned.K, turned.R, turned.t, turned.distortion
-        )
-        visible = (self.cosine(turned) > 0) & (depth > 0)
-        visible &= finite_rows(turned_pixels)
-        yield (
-            "R looks transposed",
-            np.nan_to_num(turned_pixels / factor, nan=-1.0),
-            visible,
-        )
 
     def _scan_pose(
         self, offsets: Mapping[int, Offset]

@@ -178,13 +178,13 @@ def calibration_faults(dome: DomeRecord, calibration: Calibration) -> list[Fault
     """
     faults = [*_camera_faults(dome, calibration)]
     checked = int(np.isfinite(calibration.camera_agreement).sum())
-    if len(faults) == checked > 1 and not calibration.explanations:
+    if len(faults) == checked > 1:
         faults = [
             Fault(
                 str(dome.file),
                 f"the photographs must show the face within {MAX_OFFSET_MM:g} mm of the scan",
                 f"none of {checked} cameras does",
-                f"align the scan: {_pose(calibration)}",
+                f"align the scan: {_pose(calibration)}; or correct the dome and its frames",
             )
         ]
     faults = faults or [*_light_faults(dome, calibration)]
@@ -363,12 +363,11 @@ def _camera_faults(dome: DomeRecord, calibration: Calibration) -> Iterator[Fault
         displaced = offset > MAX_OFFSET_MM or abs(scale) > MAX_SCALE
         if displaced or agreement < MIN_AGREEMENT:
             finding = f"the face {_beside(offset, scale)}, correlation {agreement:.2f}"
-            finding = calibration.explanations.get(c, finding)
             yield Fault(
                 f"{dome.file}[cameras], camera {camera.id}",
                 rule,
                 finding,
-                "correct K, R and t, the order of the frames, or the pose of the scan",
+                "correct K, R, t, the order and orientation of its frames, or the pose of the scan",
             )
 
 

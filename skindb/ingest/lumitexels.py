@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from skindb.calibration._merge_kernels import OK, SATURATED
-from skindb.calibration.frame_checks import SensorPatterns, highest_value, view_faults
+from skindb.calibration.frame_checks import highest_value, view_faults
 from skindb.calibration.irradiance import light_falloff
 from skindb.calibration.radiance import (
     FrameMerger,
@@ -158,7 +158,6 @@ class Sampler:
         none = np.zeros(self.spool.done.shape)
         self._levels = ViewLevels(unknown[0], none, unknown[1], none > 0)
         self._sampled = self.spool.done.copy()  # or found to be faulty
-        self._patterns = SensorPatterns(self.check.dome, self.mergers)
         surfels = self.check.surfels
         self._detail = Detail.of(surfels, self.check.dome.cameras)
         frontal = self.pool.map(
@@ -212,9 +211,6 @@ class Sampler:
         calibration = None
         contradictions = list[Fault]()
         pictures = self.pictures(self.check.pairs if check else ())
-        self._sample(self._patterns.pairs)
-        done = zip(*np.nonzero(self.spool.done), strict=True)
-        self.faults += self._patterns.faults(done, self.pool)
         if check and not self.faults:
             calibration = self.check.evaluate(pictures)
         if calibration is not None and refuse:
@@ -275,8 +271,6 @@ class Sampler:
         shot = self._shots[c]
         digests: Digests = {}
         frames = read_view(dome, light.id, merger.camera, digests=digests)
-        # wrong dark frames may be why the view is faulty
-        self._patterns.add(j, c, frames)
         require_none(view_faults(dome, light.id, merger, frames))
         surfels = shot.surfels & self.lit[:, j]
         fine = None
