@@ -90,10 +90,16 @@ def write_webp(path: str | Path, frames: Sequence[Bytes]) -> None:
     first.save(private_file(path), "WEBP", save_all=True, **options)
 
 
-def image_url(picture: Bytes) -> str:
-    """An sRGB picture (h, w, 3) as an address that contains it."""
-    png = imagecodecs.png_encode(np.ascontiguousarray(picture))
-    return f"data:image/png;base64,{base64.b64encode(png).decode()}"
+def image_url(picture: Bytes, *, quality: int | None = None) -> str:
+    """An sRGB picture (h, w, 3) or (h, w, 4) as an address that contains it: PNG, or
+    WebP of a quality from 1 to 100.
+    """
+    values = np.ascontiguousarray(picture)
+    if quality is None:
+        kind, data = "png", imagecodecs.png_encode(values)
+    else:
+        kind, data = "webp", imagecodecs.webp_encode(values, level=quality)
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
 
 
 def shown_part(masks: Sequence[Mask], margin: int) -> tuple[slice, slice]:

@@ -261,7 +261,7 @@ def _compared(
     model: xr.DataTree, capture: xr.DataTree, *, subsurface: bool, samples: int
 ) -> Iterator[Comparison]:
     """Comparisons of the photographs whose cameras see the face."""
-    photographs = _kept_photographs(capture)
+    photographs = kept_photographs(capture)
     dome = capture["dome"].to_dataset()
     surface = from_model(model)
     if subsurface:
@@ -270,7 +270,9 @@ def _compared(
     cameras = cameras_from_dome(dome)
     # of the model, as its intensities contain the estimated gains
     lights = lights_from_dome(model["dome"].to_dataset())
-    unseen_lights, unseen_cameras = (_held_out(model, d) for d in ("light", "camera"))
+    unseen_lights, unseen_cameras = (
+        held_out_names(model, d) for d in ("light", "camera")
+    )
     is_filled = surfel_confidence(model["fitted"].to_dataset()) == 0
     for photograph in photographs:
         at_light = int(photograph[variables.PHOTOGRAPH_LIGHT])
@@ -341,7 +343,7 @@ def _photograph_variance(photo: Image, capture: xr.DataTree, camera: int) -> Ima
     return variance
 
 
-def _kept_photographs(capture: xr.DataTree) -> list[xr.Dataset]:
+def kept_photographs(capture: xr.DataTree) -> list[xr.Dataset]:
     """The photographs of a capture, one by one.
 
     Raises
@@ -368,7 +370,7 @@ def _kept_photographs(capture: xr.DataTree) -> list[xr.Dataset]:
     ]
 
 
-def _held_out(model: xr.DataTree, dim: str) -> set[str]:
+def held_out_names(model: xr.DataTree, dim: str) -> set[str]:
     """Names of the lights or cameras that the fit did not see."""
     if "held_out" not in model.children:
         return set()

@@ -26,6 +26,7 @@ from skindb.schema import variables
 from skindb.schema.consent import honour_consent
 from skindb.schema.notes import Omission
 from skindb.types import AnyArray, Array, Faces, Float32, Half, float64, lengths, unit
+from skindb.view.photographs import photograph_records
 from skindb.view.transfer import sky_transfer
 
 COUNT = 256  # lights, in 64 passes of four
@@ -141,6 +142,7 @@ def face_record(
     attributes: Mapping[str, Any],
     traits: tuple[Trait, ...] = (),
     environment: Environment | None = None,
+    capture: xr.DataTree | None = None,
 ) -> dict[str, Any]:
     """Data of one face for the page, which can be written as JSON.
 
@@ -155,6 +157,8 @@ def face_record(
     environment
         Light from all directions; default an overcast sky. It is scaled such that a
         white surface that faces the front is displayed white.
+    capture
+        Version of kind "capture" of the take, for the photographs beside the model.
 
     Returns
     -------
@@ -195,6 +199,7 @@ def face_record(
     }
     about = _about(model, surface, take, attributes, resampled.shape)
     about["surroundings"] = _surroundings(environment, about["exposure"])
+    about["photographs"] = [] if capture is None else photograph_records(model, capture)
     return {
         "about": about,
         "arrays": {name: _encode(value) for name, value in arrays.items()},

@@ -31,6 +31,7 @@ SCRIPTS = (
     "page/visible",
     "page/sky",
     "page/painter",
+    "page/photographs",
     "page/main",
 )
 MAX_PAGE_BYTES = 30_000_000

@@ -438,7 +438,8 @@ def _faces(
         unedited, moved = _moved(db, take, model, traits, study, dictionary)
         moved += _along_modes(db, take, unedited, modes)
         attributes = {name: model.attrs[name] for name in SHOWN if name in model.attrs}
-        if db.has("capture", take):
+        capture = db.read("capture", take) if db.has("capture", take) else None
+        if capture is not None:
             attributes |= db.record("capture", take).provenance.get("traits", {})
         yield (
             face_record(
@@ -447,6 +448,7 @@ def _faces(
                 attributes=attributes,
                 traits=moved,
                 environment=around,
+                capture=capture,
             ),
             still_picture(model),
         )

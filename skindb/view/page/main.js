@@ -32,6 +32,7 @@ function redraw() {
     adapt(now);
     resize();
     if (painter.draw(state, moving !== null) < 1) redraw();
+    placePhotograph();
   });
 }
 
@@ -118,9 +119,10 @@ function showLights() {
 
 // the line is hidden where both sides are the same
 function showDivider() {
-  const cut = $("cut");
-  cut.hidden = !amounts.some(Boolean) || state.divider <= 0 || state.divider >= 1;
-  cut.style.left = `${100 * state.divider}%`;
+  const cut = $("cut"), at = Number($(photograph ? "wipe" : "divider").value), differ = photograph ? !$("gap").checked : amounts.some(Boolean);
+  cut.hidden = !differ || at <= 0 || at >= 1;
+  cut.style.left = `${100 * at}%`;
+  [cut.dataset.left, cut.dataset.right] = photograph ? ["photograph", "model"] : ["before", "after"];
 }
 
 function applyTraits() {
@@ -194,6 +196,7 @@ function load(record) {
     if (!state.lights.length) for (let i = 0; i < 2; i++) state.lights.push(newLight());
     showLights();
     showTraits();
+    showPhotographs();
     showAbout();
     showLegend();
     $("translucent").disabled = !face.translucent || !painter.floats;
@@ -242,7 +245,7 @@ function listen() {
     if (keys[event.key]) turn(...keys[event.key]);
     else if (event.key === "+" || event.key === "=") zoom(1 / 1.1);
     else if (event.key === "-") zoom(1.1);
-    else if (event.key === "0") { state.azimuth = state.elevation = 0; redraw(); }
+    else if (event.key === "0") { leavePhotograph(); state.azimuth = state.elevation = 0; redraw(); }
     else return;
     event.preventDefault();
   });
@@ -260,8 +263,9 @@ function listen() {
   $("cut").addEventListener("pointermove", (event) => {
     if (!event.buttons) return;
     const { left, width } = canvas.getBoundingClientRect();
-    $("divider").value = Math.min(Math.max((event.clientX - left) / width, 0.02), 0.98);
-    $("divider").dispatchEvent(new Event("input"));
+    const input = $(photograph ? "wipe" : "divider");
+    input.value = Math.min(Math.max((event.clientX - left) / width, 0.02), 0.98);
+    input.dispatchEvent(new Event("input"));
   });
   $("sheet").addEventListener("click", (event) => {
     const open = document.body.classList.toggle("closed");
@@ -286,12 +290,14 @@ function twoFingers(gesture, pointers) {
 }
 
 function turnView(across, up) {
+  leavePhotograph();
   state.azimuth = ((state.azimuth + across + 540) % 360) - 180;
   state.elevation = Math.min(Math.max(state.elevation + up, -85), 85);
   redrawMoving();
 }
 
 function turnLight(across, up) {
+  leavePhotograph();
   const light = state.lights[active] || state.lights[0];
   if (!light) return;  // only the environment shines
   light.azimuth = ((light.azimuth + across + 540) % 360) - 180;
@@ -303,6 +309,7 @@ function turnLight(across, up) {
 }
 
 function zoom(factor) {
+  leavePhotograph();
   state.distance = Math.min(Math.max(state.distance * factor, 1.6 * face.radius), 20 * face.radius);
   redrawMoving();
 }
@@ -329,6 +336,8 @@ function controls() {
   slider($("camera"), "exposure", { min: 0.1, max: 4, step: 0.05, value: 1 }, (x) => { state.exposure = x; });
   slider($("camera"), "softness of shadows", { min: 0, max: 6, step: 0.5, value: 1.5 }, (x) => { state.softness = x; });
   $("divider").addEventListener("input", (event) => { state.divider = Number(event.target.value); showDivider(); redrawMoving(); });
+  for (const id of ["wipe", "gap"]) $(id).addEventListener("input", () => { showDivider(); redraw(); });
+  $("leave").addEventListener("click", leavePhotograph);
   $("more").addEventListener("click", () => { state.lights.push(newLight()); showLights(); redraw(); });
   $("fewer").addEventListener("click", () => { state.lights.pop(); active = 0; showLights(); redraw(); });
   $("shot").addEventListener("click", () => {

@@ -25,6 +25,23 @@ function perspective(tangent, aspect, near, far) {
   return new Float32Array([f / aspect, 0, 0, 0, 0, f, 0, 0, 0, 0, (far + near) / d, -1, 0, 0, (2 * far * near) / d, 0]);
 }
 
+// Projection and view of a calibrated camera, whose picture fits into a canvas. Its rows point downwards, and z forward.
+function throughCamera({ K, R, t, width, height }, canvas, near, far) {
+  const fit = fitted({ width, height }, canvas), [x, y] = [2 / canvas.width, 2 / canvas.height], d = far - near;
+  const projection = new Float32Array([
+    x * fit.scale * K[0][0], 0, 0, 0, x * fit.scale * K[0][1], -y * fit.scale * K[1][1], 0, 0,
+    x * (fit.scale * K[0][2] + fit.left) - 1, 1 - y * (fit.scale * K[1][2] + fit.top), (far + near) / d, 1, 0, 0, (-2 * far * near) / d, 0,
+  ]);
+  const view = new Float32Array([0, 1, 2].flatMap((c) => [R[0][c], R[1][c], R[2][c], 0]).concat(t, 1));
+  return product(projection, view);
+}
+
+// place of a picture that fits into the middle of another
+function fitted(inner, outer) {
+  const scale = Math.min(outer.width / inner.width, outer.height / inner.height);
+  return { scale, left: (outer.width - scale * inner.width) / 2, top: (outer.height - scale * inner.height) / 2 };
+}
+
 // direction from the middle of the face; 0, 0 is the front, and angles are in degrees to the subject's left and upwards
 function direction(azimuth, elevation) {
   const a = (azimuth * Math.PI) / 180, e = (elevation * Math.PI) / 180;

@@ -293,11 +293,13 @@ class Painter {
   // `span` is the part of the picture that is drawn, as horizontal places from -1 to 1
   drawFace(name, state, { uniforms, glow, sums, mirror, span }) {
     const gl = this.gl, { width, height } = this.canvas, { face } = this;
-    const eye = state.eye || add(face.centre, direction(state.azimuth, state.elevation), state.distance);
+    const { through } = state, eye = through ? through.eye : state.eye || add(face.centre, direction(state.azimuth, state.elevation), state.distance);
     const reach = Math.hypot(...sub(eye, face.centre));
     const near = Math.max(reach - 1.2 * face.radius, 1), far = reach + 1.2 * face.radius;
     const tangent = state.tangent / Math.min(1, (FACE_HEIGHT_OVER_WIDTH * width) / height);  // a narrow picture shows the whole face
-    const matrix = product(perspective(tangent, width / height, near, far), lookAt(eye, state.target || face.centre, [0, 1, 0]));
+    const matrix = through
+      ? throughCamera(through, this.canvas, near, far)
+      : product(perspective(tangent, width / height, near, far), lookAt(eye, state.target || face.centre, [0, 1, 0]));
     gl.enable(gl.DEPTH_TEST);
     gl.enable(gl.CULL_FACE);
     this.bindTextures([
