@@ -22,7 +22,6 @@ from skindb.limits import (
     MAX_FRAME_SIDE_PX,
     MAX_FRAMES,
     MAX_LIGHTS,
-    MAX_PERMUTATIONS,
     MAX_PHOTOGRAPHS,
     MAX_PLACEMENTS,
     MAX_RELIEF_POINTS,
@@ -85,54 +84,9 @@ def option(default: Any, help: str, **limits: Any) -> Any:  # noqa: A002
     return field(default=default, metadata={"option": Option(help, **limits)})
 
 
-def group_option() -> Any:
-    """Field of a record for the attribute or trait of the groups."""
-    text = "Attribute or trait by which takes are grouped: gender, age, ..."
-    return option(None, text)
-
-
-def compared_option() -> Any:
-    """Field of a record for the attribute or trait that is compared, which has no default."""
-    text = "Attribute or trait that is compared: gender, age, ..."
-    return option(MISSING, text)
-
-
-def adjust_option() -> Any:
-    """Field of a record for attributes that a comparison is adjusted for."""
-    text = "Attributes that the comparison adjusts for, separated by commas."
-    return option((), text, metavar="NAME,...", show_default=False)
-
-
-def quantities_option() -> Any:
-    """Field of a record for the quantities of a study."""
-    text = (
-        "Quantities, separated by commas: R_d, surface reflectance, sigma_tr, L*, a*, b*, "
-        "ITA, melanin index, erythema index, glossiness, albedo contrast, RMS slope.  "
-        "[default: the first three]"
-    )
-    return option((), text, metavar="NAME,...", show_default=False)
-
-
-def permutations_option(default: int = 10_000) -> Any:
-    """Field of a record for the number of permutations."""
-    text = "Largest number of permutations for p values."
-    return option(default, text, minimum=100, maximum=MAX_PERMUTATIONS)
-
-
 def seed_option(purpose: str, default: int = 0) -> Any:
     """Field of a record for the random seed."""
     return option(default, f"Random seed for {purpose}.", minimum=0, maximum=MAX_SEED)
-
-
-@dataclass(frozen=True)
-class ContrastParameters:
-    """Parameters of a study that compares groups of subjects."""
-
-    group_by: str = compared_option()
-    adjust: tuple[str, ...] = adjust_option()
-    quantities: tuple[str, ...] = quantities_option()
-    permutations: int = permutations_option()
-    seed: int = seed_option("the permutations")
 
 
 def option_of(record: type, name: str) -> Option:

@@ -27,10 +27,10 @@ from skindb.analysis.summary import SAMPLED
 from skindb.errors import require
 from skindb.numerics.statistics import SUMMARY, known_mean
 from skindb.numerics.texture import QUANTILES, quantile_levels
-from skindb.parameters import group_option
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
 from skindb.schema.label import CHANNELS, FACE
+from skindb.study_parameters import DECLARED, GroupParameters
 from skindb.types import Array, Mask, finite_rows
 
 if TYPE_CHECKING:
@@ -326,13 +326,6 @@ def tabulate_albedo(table: Dataset, histograms: Dataset) -> Table:
     return table_of(table, [f"group_albedo_{name}" for name in SUMMARY])
 
 
-@dataclass(frozen=True)
-class Parameters:
-    """Parameters of the study of albedo."""
-
-    group_by: str | None = group_option()
-
-
 def albedo_and_texture(population: Population) -> Results:
     """Histograms of albedo, and distributions at every scale of the takes that are
     registered, whose landmarks draw the regions that captures lack.
@@ -353,7 +346,7 @@ def albedo_and_texture(population: Population) -> Results:
     return {"albedo": histograms, "texture": distributions}
 
 
-def compute(population: Population, parameters: Parameters) -> Results:
+def compute(population: Population, parameters: GroupParameters) -> Results:
     """The results of the study."""
     results = albedo_and_texture(population)
     table = albedo_table(
@@ -363,10 +356,8 @@ def compute(population: Population, parameters: Parameters) -> Results:
 
 
 STUDY = Study(
-    name="albedo",
-    description="distribution of the diffuse albedo",
+    *DECLARED["albedo"],
     layout="surfels",
-    parameters=Parameters,
     compute=compute,
     shown=("albedo_table", "albedo"),
     tabulate=tabulate_albedo,

@@ -5,8 +5,6 @@ basis BRDFs that skin needs (Weyrich et al. 2005, sections 7 and 10.1, figure 15
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,13 +28,13 @@ from skindb.numerics.factorise import Sums, nmf, refine
 from skindb.numerics.nnls import solve_nnls
 from skindb.numerics.statistics import bootstrap_interval
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.parameters import DICTIONARY_HELP, option, seed_option
 from skindb.reflectance.kinds import even_diffuse
 from skindb.reflectance.mixture import basis_rows
 from skindb.reflectance.reduction import Systems, factor_reflectance, residuals
 from skindb.reflectance.tables import TableGrid, brdf_metric
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
+from skindb.study_parameters import DECLARED, BrdfParameters
 from skindb.threads import c_contiguous
 from skindb.types import Array, Float32, Index, dots, finite_rows, unit
 
@@ -510,15 +508,7 @@ def plot_basis_size(curves: Mapping[str, Dataset], *, ax: Axes | None = None) ->
     return ax
 
 
-@dataclass(frozen=True)
-class Parameters:
-    """Parameters of the study of the number of bases."""
-
-    seed: int = seed_option("the bootstrap")
-    dictionary: Path | None = option(None, DICTIONARY_HELP)
-
-
-def compute(population: Population, parameters: Parameters) -> Results:
+def compute(population: Population, parameters: BrdfParameters) -> Results:
     """The results of the study."""
     cohort = population.cohort
     # the order of a sample is random: its first surfels are a random sample as well
@@ -532,10 +522,8 @@ def compute(population: Population, parameters: Parameters) -> Results:
 
 
 STUDY = Study(
-    name="brdf",
-    description="number of basis BRDFs that the population needs",
+    *DECLARED["brdf"],
     layout="surfels",
-    parameters=Parameters,
     compute=compute,
     shown=("basis_size",),
     tabulate=tabulate_basis_size,

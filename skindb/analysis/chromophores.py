@@ -43,10 +43,10 @@ from skindb.analysis.texture import (
 )
 from skindb.errors import require
 from skindb.numerics.statistics import SUMMARY
-from skindb.parameters import group_option, seed_option
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
 from skindb.schema.label import CHANNELS, FACE
+from skindb.study_parameters import DECLARED, ChromophoreParameters
 from skindb.types import Array, Mask, finite_rows, lengths
 
 if TYPE_CHECKING:
@@ -523,15 +523,7 @@ def plot_chromophores(table: Dataset, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
-@dataclass(frozen=True)
-class Parameters:
-    """Parameters of the study of chromophores."""
-
-    group_by: str | None = group_option()
-    seed: int = seed_option("the independent components and the bootstrap")
-
-
-def compute(population: Population, parameters: Parameters) -> Results:
+def compute(population: Population, parameters: ChromophoreParameters) -> Results:
     """The results of the study."""
     cohort = population.cohort
     landmarks = population.landmarks
@@ -548,11 +540,9 @@ def compute(population: Population, parameters: Parameters) -> Results:
 
 
 STUDY = Study(
-    name="chromophores",
-    description="melanin and haemoglobin in maps of albedo",
+    *DECLARED["chromophores"],
     layout="maps",
     absolute=True,
-    parameters=Parameters,
     compute=compute,
     shown=("chromophores", "chromophore_table"),
     tabulate=lambda _, table: table_of(table, COLUMNS),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,9 +9,9 @@ from xarray import DataArray, Dataset
 
 from skindb.analysis.face_models import ALBEDO, POSITION, face_at, face_model
 from skindb.analysis.study import Study, Table, of_cohort, table_of
-from skindb.parameters import adjust_option, option, seed_option
 from skindb.render.image import tone_map
 from skindb.schema import variables
+from skindb.study_parameters import DECLARED
 from skindb.types import unit
 
 if TYPE_CHECKING:
@@ -101,20 +100,9 @@ def privacy_notes(model: Dataset) -> list[str]:
     return []
 
 
-@dataclass(frozen=True)
-class Parameters:
-    """Parameters of the study of components."""
-
-    k: int = option(5, "Largest number of modes.", minimum=1)
-    adjust: tuple[str, ...] = adjust_option()
-    seed: int = seed_option("samples whose distance from subjects is reported")
-
-
 STUDY = Study(
-    name="components",
-    description="joint modes of shape, albedo, gloss and translucency, drawn as faces",
+    *DECLARED["components"],
     layout="maps",
-    parameters=Parameters,
     compute=of_cohort("face_model", face_model),
     shown=("face_model",),
     tabulate=tabulate_face_model,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -17,10 +16,10 @@ from skindb.analysis.study import Study, of_cohort, skipped_takes, table_of
 from skindb.analysis.subjects import takes_to_compare
 from skindb.errors import require
 from skindb.numerics.statistics import known_mean
-from skindb.parameters import permutations_option, seed_option
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
 from skindb.schema.label import CHANNELS, FACE
+from skindb.study_parameters import DECLARED
 from skindb.types import Array, finite_rows
 
 if TYPE_CHECKING:
@@ -220,19 +219,9 @@ def plot_correlations(table: Dataset, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
-@dataclass(frozen=True)
-class Parameters:
-    """Parameters of the study of correlations."""
-
-    permutations: int = permutations_option()
-    seed: int = seed_option("the permutations and the bootstrap")
-
-
 STUDY = Study(
-    name="correlations",
-    description="correlations between albedo, surface BRDF and translucency",
+    *DECLARED["correlations"],
     layout="tables",
-    parameters=Parameters,
     compute=of_cohort("correlations", component_correlations),
     shown=("correlations",),
     tabulate=lambda table: table_of(table, COLUMNS),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,6 +23,7 @@ from skindb.analysis.subjects import (
 from skindb.errors import few_names, require
 from skindb.schema import IDENTIFIED, dataset, variables
 from skindb.schema.cohort import require_takes
+from skindb.study_parameters import DECLARED
 from skindb.types import Array, Mask
 
 if TYPE_CHECKING:
@@ -282,16 +282,9 @@ def _values(cell: Words) -> str:
     return AND.join(part.partition(": ")[2] for part in cell)
 
 
-@dataclass(frozen=True)
-class Parameters:
-    """The study of coverage has no parameters."""
-
-
 STUDY = Study(
-    name="coverage",
-    description="number of subjects by skin type, gender and age",
+    *DECLARED["coverage"],
     layout="tables",
-    parameters=Parameters,
     compute=of_cohort("coverage", coverage_report),
     shown=("coverage",),
     tabulate=lambda report: table_of(report, [variables.COVERAGE_COUNT]),

@@ -7,7 +7,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import MISSING, dataclass
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -34,9 +34,10 @@ from skindb.analysis.study import Study, Table, of_cohort, skipped_takes, table_
 from skindb.analysis.subjects import CONDITION, NORMAL
 from skindb.errors import InputError, input_error, require
 from skindb.numerics.statistics import ROUNDING
-from skindb.parameters import option, require_limits
+from skindb.parameters import require_limits
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
+from skindb.study_parameters import DECLARED, ModelParameters
 from skindb.types import Array, Mask
 
 if TYPE_CHECKING:
@@ -120,7 +121,7 @@ def linear_model(
     """
     require_comparable(cohort, "tables")
     contrasts = (contrasts,) if isinstance(contrasts, str) else tuple(contrasts)
-    require_limits(Parameters(formula, contrasts, margin))
+    require_limits(ModelParameters(formula, contrasts, margin))
     model = MixedModel.of(formula)
     frame = tidy(cohort)
     unused = {*VALUES, "take"} - {BASELINE}
@@ -590,33 +591,9 @@ def plot_model(table: Dataset, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
-@dataclass(frozen=True)
-class Parameters:
-    """Parameters of the study of a model."""
-
-    formula: str = option(
-        MISSING,
-        "Formula, such as: ITA ~ treatment * visit + age + (1 | subject).",
-    )
-    contrasts: tuple[str, ...] = option(
-        (),
-        "Sums of multiples of terms to estimate, separated by commas.",
-        metavar="TERMS,...",
-        show_default=False,
-    )
-    margin: float | None = option(
-        None,
-        "Largest effect that does not matter, for tests of equivalence.",
-        minimum=1e-9,
-        maximum=1e9,
-    )
-
-
 STUDY = Study(
-    name="model",
-    description="effects of attributes, conditions and visits by a formula",
+    *DECLARED["model"],
     layout="tables",
-    parameters=Parameters,
     compute=of_cohort("linear_model", linear_model),
     shown=("linear_model",),
     tabulate=tabulate_model,

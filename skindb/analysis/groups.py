@@ -27,10 +27,10 @@ from skindb.analysis.subjects import notes_on_attributes, subjects_of
 from skindb.errors import InputError, few_names
 from skindb.numerics.inference import Effects
 from skindb.numerics.statistics import detectable_difference, known_mean
-from skindb.parameters import ContrastParameters
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
 from skindb.schema.label import CHANNELS
+from skindb.study_parameters import DECLARED
 from skindb.types import Array
 
 if TYPE_CHECKING:
@@ -411,10 +411,8 @@ def tabulate_group_effects(table: Dataset) -> Table:
 
 
 STUDY = Study(
-    name="groups",
-    description="differences between groups of subjects, with intervals and p values",
+    *DECLARED["groups"],
     layout="tables",
-    parameters=ContrastParameters,
     compute=of_cohort("effects", group_effects),
     shown=("effects",),
     tabulate=tabulate_group_effects,

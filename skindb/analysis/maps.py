@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -36,10 +36,10 @@ from skindb.analysis.study import (
 )
 from skindb.analysis.subjects import level_error, notes_on_attributes, subjects_of
 from skindb.errors import Fault, InputError, require
-from skindb.parameters import ContrastParameters, permutations_option
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
 from skindb.schema.label import CHANNELS
+from skindb.study_parameters import DECLARED, PERMUTATIONS
 from skindb.types import Array, finite_rows
 
 if TYPE_CHECKING:
@@ -52,7 +52,6 @@ SIZE = 256
 MIN_FRACTION = 0.8
 COVERED = 0.5  # minimum fraction of a texel that must be measured
 LOGARITHMIC = "sigma_tr"
-PERMUTATIONS = 1000  # of each of 65,536 texels
 SHOWN_FRACTION = 0.995  # fraction of the texels within the range of a colour scale
 SHOWN = ("R_d G", SURFACE, "sigma_tr G")
 
@@ -380,18 +379,9 @@ def _plot_quantity(line: Sequence[Axes], maps: Dataset) -> None:
         line[0].contour(differ, levels=[0.5], colors="black", linewidths=0.6)
 
 
-@dataclass(frozen=True)
-class Parameters(ContrastParameters):
-    """Parameters of the study of maps."""
-
-    permutations: int = permutations_option(PERMUTATIONS)
-
-
 STUDY = Study(
-    name="maps",
-    description="differences between groups at every texel of the common (u, v)",
+    *DECLARED["maps"],
     layout="maps",
-    parameters=Parameters,
     compute=of_cohort("effect_maps", effect_maps),
     shown=("effect_maps",),
     tabulate=tabulate_effect_maps,

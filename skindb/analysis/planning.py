@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import MISSING, dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -28,9 +27,10 @@ from skindb.analysis.formulas import (
 from skindb.analysis.long_form import INTERCEPT
 from skindb.analysis.study import Study, of_cohort, table_of
 from skindb.errors import require
-from skindb.parameters import option, require_limits
+from skindb.parameters import require_limits
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import visit_of
+from skindb.study_parameters import DECLARED, PlanParameters
 from skindb.types import Array, Index
 
 if TYPE_CHECKING:
@@ -38,8 +38,6 @@ if TYPE_CHECKING:
 
 SIGNIFICANT = 0.05
 MAX_SUBJECTS = 10_000
-MAX_VISITS = 100
-MAX_DOSES = 10
 PARALLEL = "parallel"
 Design = Literal["parallel", "crossover"]
 COLUMNS = (
@@ -107,7 +105,9 @@ def sample_sizes(
     Noncentral t with the degrees of freedom of `linear_model`; Fitzmaurice, Laird and
     Ware 2011, chapter 20.
     """
-    chosen = Parameters(formula, term, effect, power, visits, design, doses, drop_out)
+    chosen = PlanParameters(
+        formula, term, effect, power, visits, design, doses, drop_out
+    )
     require_limits(chosen)
     model = MixedModel.of(formula)
     names_of(model, [SUBJECT, "treatment", "visit"])
@@ -217,39 +217,9 @@ def plot_plan(table: Dataset, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
-@dataclass(frozen=True)
-class Parameters:
-    """Parameters of the study that plans another one."""
-
-    formula: str = option(
-        MISSING, "Formula, such as: ITA ~ treatment * visit + (1 | subject)."
-    )
-    term: str = option("treatment", "Term to find, or a sum of multiples of terms.")
-    effect: float = option(
-        1.0, "Its value, in the unit of the quantity.", minimum=-1e9, maximum=1e9
-    )
-    power: float = option(0.8, "Probability to find it.", minimum=0.1, maximum=0.99)
-    visits: int = option(1, "Visits of each subject.", minimum=1, maximum=MAX_VISITS)
-    design: Literal["parallel", "crossover"] = option(
-        "parallel",
-        "Each subject has one dose of the treatment, or all of them.",
-    )
-    doses: int = option(
-        1,
-        "Largest dose: treatment is 0, 1, ... up to it.",
-        minimum=1,
-        maximum=MAX_DOSES,
-    )
-    drop_out: float = option(
-        0.0, "Fraction of the subjects who leave.", minimum=0.0, maximum=0.9
-    )
-
-
 STUDY = Study(
-    name="plan",
-    description="numbers of subjects that a study needs, from the variances of repeats",
+    *DECLARED["plan"],
     layout="tables",
-    parameters=Parameters,
     compute=of_cohort("plan", sample_sizes),
     shown=("plan",),
     tabulate=lambda table: table_of(table, COLUMNS, ("quantity",)),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,9 +20,9 @@ from skindb.numerics.statistics import (
     agreement_correlation,
     intraclass_correlation,
 )
-from skindb.parameters import option, quantities_option
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable, visit_of
+from skindb.study_parameters import DECLARED
 from skindb.types import Array
 
 if TYPE_CHECKING:
@@ -185,19 +184,9 @@ def plot_repeatability(table: Dataset, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
-@dataclass(frozen=True)
-class Parameters:
-    """Parameters of the study of repeatability."""
-
-    condition: str = option("normal", "Condition of the takes.")
-    quantities: tuple[str, ...] = quantities_option()
-
-
 STUDY = Study(
-    name="repeatability",
-    description="reliability and repeatability of quantities, from repeated takes",
+    *DECLARED["repeatability"],
     layout="tables",
-    parameters=Parameters,
     compute=of_cohort("repeatability", repeatability),
     shown=("repeatability",),
     tabulate=tabulate_repeatability,

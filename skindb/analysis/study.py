@@ -143,12 +143,12 @@ class Study:
         Word by which it is requested and stored.
     description
         What it finds, in a few words: the help of its command is "Study the ...".
-    layout
-        Layout of the cohort that it reads, see `Database.cohort`. Cohorts of maps have
-        registered takes only, which need landmarks.
     parameters
         Frozen record of its parameters, whose fields have the help and the limits of the
         options of the command.
+    layout
+        Layout of the cohort that it reads, see `Database.cohort`. Cohorts of maps have
+        registered takes only, which need landmarks.
     compute
         Function of a `Population` and of the parameters that returns groups of variables.
     shown
@@ -173,8 +173,8 @@ class Study:
 
     name: str
     description: str
-    layout: Literal["tables", "surfels", "maps"]
     parameters: type[Any]
+    layout: Literal["tables", "surfels", "maps"]
     compute: Callable[[Population, Any], Results]
     shown: tuple[str, ...]
     tabulate: Callable[..., Table]

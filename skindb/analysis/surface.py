@@ -8,7 +8,6 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -49,16 +48,10 @@ from skindb.numerics.inference import (
     within_subjects_p,
 )
 from skindb.numerics.statistics import known_mean
-from skindb.parameters import (
-    DICTIONARY_HELP,
-    compared_option,
-    option,
-    permutations_option,
-    seed_option,
-)
 from skindb.reflectance.tables import TableGrid, brdf_coords, stored_brdf
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
+from skindb.study_parameters import DECLARED, SurfaceParameters
 from skindb.threads import c_contiguous
 from skindb.types import AnyArray, Array, Mask, finite_rows, unit
 
@@ -439,24 +432,7 @@ def describe_brdf_space(space: Dataset) -> list[str]:
     ]
 
 
-@dataclass(frozen=True)
-class Parameters:
-    """Parameters of the study of surfaces."""
-
-    group_by: str = compared_option()
-    pairs: tuple[str, ...] = option(
-        (),
-        "Pairs of interest, separated by commas, such as: normal to lotion.  [default: all]",
-        metavar="PAIR,...",
-        show_default=False,
-    )
-    k: int = option(6, "Number of components of the common basis.", minimum=1)
-    permutations: int = permutations_option()
-    seed: int = seed_option("the factorisation and the permutations")
-    dictionary: Path | None = option(None, DICTIONARY_HELP)
-
-
-def compute(population: Population, parameters: Parameters) -> Results:
+def compute(population: Population, parameters: SurfaceParameters) -> Results:
     """The results of the study."""
     cohort = population.open_cohort("tables")
     grouped_takes(cohort, parameters.group_by)  # before anything is computed
@@ -485,10 +461,8 @@ def compute(population: Population, parameters: Parameters) -> Results:
 
 
 STUDY = Study(
-    name="surface",
-    description="differences between the surface BRDFs of groups",
+    *DECLARED["surface"],
     layout="surfels",
-    parameters=Parameters,
     compute=compute,
     shown=("brdf_space",),
     tabulate=tabulate_brdf_space,

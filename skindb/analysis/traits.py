@@ -7,7 +7,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -40,10 +39,10 @@ from skindb.analysis.summary import SAMPLED
 from skindb.errors import InputError, require
 from skindb.numerics.inference import missing_patterns
 from skindb.numerics.statistics import known_mean
-from skindb.parameters import DICTIONARY_HELP, adjust_option, option, seed_option
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
 from skindb.schema.label import CHANNELS, FACE
+from skindb.study_parameters import DECLARED, TraitParameters
 from skindb.types import Array, Mask, finite_rows, float64
 
 if TYPE_CHECKING:
@@ -388,17 +387,7 @@ def tabulate_traits(traits: Dataset) -> Table:
     return table_of(traits.assign(columns), list(columns))
 
 
-@dataclass(frozen=True)
-class Parameters:
-    """Parameters of the study of traits."""
-
-    k: int = option(6, "Number of components of the common basis.", minimum=1)
-    adjust: tuple[str, ...] = adjust_option()
-    seed: int = seed_option("the factorisation and the bootstrap")
-    dictionary: Path | None = option(None, DICTIONARY_HELP)
-
-
-def compute(population: Population, parameters: Parameters) -> Results:
+def compute(population: Population, parameters: TraitParameters) -> Results:
     """The results of the study."""
     rng = np.random.default_rng(parameters.seed)
     basis = population_basis(
@@ -420,10 +409,8 @@ def compute(population: Population, parameters: Parameters) -> Results:
 
 
 STUDY = Study(
-    name="traits",
-    description="vectors of BRDF, albedo and translucency for each attribute",
+    *DECLARED["traits"],
     layout="surfels",
-    parameters=Parameters,
     compute=compute,
     shown=("traits",),
     tabulate=tabulate_traits,

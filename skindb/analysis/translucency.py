@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,10 +14,10 @@ from skindb.analysis.study import Study, of_cohort, table_of
 from skindb.analysis.subjects import Groups, grouped
 from skindb.errors import require
 from skindb.numerics.statistics import SUMMARY, known_mean
-from skindb.parameters import group_option
 from skindb.schema import ProbeStatus, dataset, variables
 from skindb.schema.cohort import require_comparable
 from skindb.schema.label import CHANNELS
+from skindb.study_parameters import DECLARED
 from skindb.types import Array, float64
 
 if TYPE_CHECKING:
@@ -184,18 +183,9 @@ def plot_translucency(table: Dataset, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
-@dataclass(frozen=True)
-class Parameters:
-    """Parameters of the study of translucency."""
-
-    group_by: str | None = group_option()
-
-
 STUDY = Study(
-    name="translucency",
-    description="translucency by site of the face",
+    *DECLARED["translucency"],
     layout="tables",
-    parameters=Parameters,
     compute=of_cohort("translucency_table", translucency_table),
     shown=("translucency_table",),
     tabulate=lambda table: table_of(table, COLUMNS),

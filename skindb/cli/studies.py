@@ -1,26 +1,16 @@
-"""The command analyze, with one command for each study, and tidy.
-
-The names, descriptions and parameters of the studies are read from their source: the help
-is shown, and wrong options are refused, without importing the science that the studies
-use.
-"""
+"""The command analyze, with one command for each study, and tidy."""
 
 from __future__ import annotations
 
-import ast
-import importlib
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable
 from csv import reader
-from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 import skindb
-from skindb import parameters as parameter_module
 from skindb import workflow
 from skindb.cli.options import (
     DB,
@@ -36,6 +26,7 @@ from skindb.cli.shared import aligned, cluster, emit, existing, shared_path, wri
 from skindb.cli.terminal import HelpContext, bar
 from skindb.errors import input_error
 from skindb.files import csv_text, private_file
+from skindb.study_parameters import DECLARED, Declaration
 
 if TYPE_CHECKING:
     from xarray import DataTree
@@ -49,7 +40,6 @@ NOTES = {  # of results, with their labels
     "spacing": "spacing",
     "as_normal": "as normal",
 }
-ANALYSIS = Path(skindb.__file__).parent / "analysis"
 # of every study, after its own parameters
 STORED = (
     click.option(
@@ -88,92 +78,21 @@ FURTHER = {
 }
 
 
-@dataclass(frozen=True)
-class Declaration:
-    """What the help shows of a study: its name, description and record of parameters."""
-
-    name: str
-    description: str
-    parameters: type[Any]
-
-
-@cache
-def declarations() -> Mapping[str, Declaration]:
-    """The studies by their names, in the order of the list in skindb/analysis/studies.py."""
-    tree = ast.parse((ANALYSIS / "studies.py").read_bytes())
-    modules = {
-        alias.asname: str(node.module)
-        for node in tree.body
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-        if alias.name == "STUDY"
-    }
-    listed = next(
-        node
-        for node in tree.body
-        if isinstance(node, ast.AnnAssign) and ast.unparse(node.target) == "STUDIES"
-    )
-    names = [node.id for node in ast.walk(listed) if isinstance(node, ast.Name)]
-    studies = [_declaration(modules[name]) for name in names if name in modules]
-    return {study.name: study for study in studies}
-
-
-def _declaration(module: str) -> Declaration:
-    """The declaration of the study in a module.
-
-    The assignment STUDY is read, and the constants and the record of parameters of the
-    module are evaluated. If they need something else, the module is imported.
-    """
-    tree = ast.parse((ANALYSIS / f"{module.rpartition('.')[2]}.py").read_bytes())
-    values = {
-        ast.unparse(node.targets[0]): node.value
-        for node in tree.body
-        if isinstance(node, ast.Assign)
-    }
-    classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
-    try:
-        study = values["STUDY"]
-        assert isinstance(study, ast.Call)
-        settings = {str(keyword.arg): keyword.value for keyword in study.keywords}
-        record = ast.unparse(settings["parameters"])
-        scope = {"Path": Path, "dataclass": dataclass, **vars(parameter_module)}
-        scope |= _constants(values)
-        body: list[ast.stmt] = [node for node in classes if node.name == record]
-        code = compile(ast.Module(body, []), module, "exec", dont_inherit=True)
-        exec(code, scope)
-        name = ast.literal_eval(settings["name"])
-        return Declaration(
-            name, ast.literal_eval(settings["description"]), scope[record]
-        )
-    except (AssertionError, KeyError, NameError, ValueError):
-        imported = importlib.import_module(module).STUDY
-        return Declaration(imported.name, imported.description, imported.parameters)
-
-
-def _constants(values: Mapping[str, ast.expr]) -> dict[str, Any]:
-    """The values of names that are literals."""
-    constants = {}
-    for name, value in values.items():
-        with suppress(ValueError):
-            constants[name] = ast.literal_eval(value)
-    return constants
-
-
 class Studies(click.Group):
     """The studies as commands, each with the options of its own parameters."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
         """Names of the studies."""
-        return list(declarations())
+        return list(DECLARED)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command:
         """The command of a study."""
-        if cmd_name not in declarations():
-            names = ", ".join(declarations())
+        if cmd_name not in DECLARED:
+            names = ", ".join(DECLARED)
             raise click.UsageError(
                 f"Invalid value for 'STUDY': {cmd_name!r} is not one of {names}.", ctx
             )
-        return _study_command(declarations()[cmd_name])
+        return _study_command(DECLARED[cmd_name])
 
 
 @click.group(
@@ -189,7 +108,7 @@ def analyze(ctx: click.Context, db: str) -> None:
     study are listed by: skindb analyze DB STUDY --help
     """
     if ctx.invoked_subcommand is None:
-        names = ",\n\t".join(declarations())
+        names = ",\n\t".join(DECLARED)
         raise click.UsageError(f"Missing argument 'STUDY'. Choose from:\n\t{names}")
     ctx.obj = db
 

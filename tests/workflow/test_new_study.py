@@ -1,4 +1,4 @@
-"""A study is one file and one name in a list: a copy of skindb gets another one."""
+"""A study is a file, a name in a list and a declaration: a copy of skindb gets another one."""
 
 from __future__ import annotations
 
@@ -18,20 +18,11 @@ from skindb.store import Database
 STUDY = '''
 """Fraction of the skin that is lighter than a limit."""
 
-from dataclasses import dataclass
-
 from matplotlib import pyplot
 
 from skindb.analysis.study import Study, table_of
-from skindb.parameters import option
 from skindb.schema import dataset
-
-
-@dataclass(frozen=True)
-class Parameters:
-    """Parameters of the study."""
-
-    limit: float = option(0.5, "Albedo of light skin.", minimum=0.0, maximum=1.0)
+from skindb.study_parameters import DECLARED
 
 
 def compute(population, parameters):
@@ -51,14 +42,25 @@ def plot(table):
 
 
 STUDY = Study(
-    name="lightness",
-    description="fraction of light skin",
+    *DECLARED["lightness"],
     layout="tables",
-    parameters=Parameters,
     compute=compute,
     shown=("coverage",),
     tabulate=lambda table: table_of(table, ["coverage_count"], ["cell"]),
     plot=plot,
+)
+'''
+RECORD = '''
+
+@dataclass(frozen=True)
+class LightnessParameters:
+    """Parameters of the study."""
+
+    limit: float = option(0.5, "Albedo of light skin.", minimum=0.0, maximum=1.0)
+
+
+DECLARED["lightness"] = Declaration(
+    "lightness", "fraction of light skin", LightnessParameters
 )
 '''
 COMMAND = "from skindb.cli import main; main()"
@@ -81,6 +83,8 @@ def run(tmp_path_factory):
     ignored = shutil.ignore_patterns("__pycache__")
     shutil.copytree(Path(skindb.__file__).parent, package, ignore=ignored)
     (package / "analysis" / "lightness.py").write_text(STUDY)
+    with (package / "study_parameters.py").open("a") as stream:
+        stream.write(RECORD)
     studies = package / "analysis" / "studies.py"
     text = studies.read_text()
     text = text.replace(
