@@ -12,7 +12,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
-from types import UnionType
+from types import NoneType, UnionType
 from typing import Any, Literal, Self, Union, get_args, get_origin, get_type_hints
 
 from skindb.errors import Fault, input_error, require_none
@@ -125,6 +125,8 @@ def broken_rule(limits: Option, hint: Any, value: Any) -> str:
     if value in words or (isinstance(value, bool) and bool in get_args(hint)):
         return ""
     if words and low is None:
+        if value is None and NoneType in get_args(hint):
+            return ""
         return f"must be one of {', '.join(words)}"
     if low is None or value is None:
         return ""
@@ -513,16 +515,27 @@ class SessionParameters(Limited):
     scan: Path | None = option(None, "Triangle mesh of the face in mm.")
     landmarks: Path | None = option(None, "Landmarks on the scan (.json).")
     regions: Path | None = option(None, "Regions of the scan (.json).")
-    calibration: str | None = option(
+    calibrated_by: str | None = option(
         None, "Name of the calibration of the dome that ingest takes from the database."
+    )
+    calibration: Literal["board", "white", "ball", "dark", "flat", "chart"] | None = (
+        option(
+            None,
+            "Record this calibration target into OUT, the folder of the laboratory, in place "
+            "of a subject.",
+        )
     )
     sites: str = option(
         "",
         "Sites that the probe measures, separated by commas.  [default: none]",
         show_default=False,
     )
-    placements: int = option(
-        1, "Placements of the probe on each site.", minimum=1, maximum=MAX_PLACEMENTS
+    placements: int | None = option(
+        None,
+        "Placements of the probe on each site, poses of the board or places of the ball.  "
+        "[default: 1, 12, 3]",
+        minimum=1,
+        maximum=MAX_PLACEMENTS,
     )
     seconds: float | None = option(
         None,

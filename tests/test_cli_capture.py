@@ -312,7 +312,7 @@ def test_capture__mistakes_of_a_real_session(rehearsal, tmp_path):
         "--consent", "fit", "--subject", "Anna Müller"
     )
     assert "capture.json[calibration]: must be 1 to 64" in said(
-        "--consent", "fit", "--calibration", "a b"
+        "--consent", "fit", "--calibrated-by", "a b"
     )
     assert "--sites: a name must be 1 to 64 letters" in said(
         "--consent", "fit", "--sites", "left cheek"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from skindb.errors import Fault, few_names, require, require_none
 from skindb.format.fields import Fields, read_json
-from skindb.format.frames import CAMERA, filled, opencv, read_frame
+from skindb.format.frames import CAMERA, Frame, filled, opencv, read_frame
 from skindb.geometry.camera import Pinhole
 from skindb.limits import MAX_BALL_PLACES, MAX_CAMERAS
 from skindb.types import Array, Float64, Index, float64
 
 FILE = "dome/boards.json"
 POSE = "pose"
+DICTIONARY = "DICT_5X5_100"
 MIN_CORNERS = 8  # in a picture
 MIN_POSES = 4  # of a camera; three determine it without a check
 # rms of a camera; OpenCV finds corners to 0.1 px in sharp pictures
@@ -65,7 +66,7 @@ def read_boards(folder: Path) -> Boards:
     count = fields.integer("poses", minimum=MIN_POSES, maximum=MAX_BALL_PLACES)
     squares = fields.array("squares", (2,)).astype(int)
     square, marker = (fields.number(n, minimum=0.1) for n in ("square", "marker"))
-    name = fields.text("dictionary", default="DICT_5X5_100")
+    name = fields.text("dictionary", default=DICTIONARY)
     cameras = fields.names("cameras", maximum=MAX_CAMERAS)
     if not hasattr(cv2.aruco, name):
         fields.fault("dictionary", "must be one of OpenCV", name)
@@ -76,8 +77,7 @@ def read_boards(folder: Path) -> Boards:
             "others",
         )
     require_none(faults)
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
-    board = cv2.aruco.CharucoBoard(tuple(squares.tolist()), square, marker, dictionary)
+    board = printed_board(squares.tolist(), square, marker, name)
     detector = cv2.aruco.CharucoDetector(board)
     views: Views = {}
     sizes = dict[str, tuple[int, int]]()
@@ -86,21 +86,16 @@ def read_boards(folder: Path) -> Boards:
             file = folder / filled(template, camera=camera, pose=str(pose))
             if not file.is_file():
                 continue  # not every camera sees every pose
-            frame = float64(read_frame(file)).mean(axis=2)
+            frame = read_frame(file)
             size = (frame.shape[1], frame.shape[0])
             if sizes.setdefault(camera, size) != size:
                 rule = "pictures of a camera must have one size"
                 side = f"{size[0]} x {size[1]}"
                 fields.faults.append(Fault(str(file), rule, side, "take it again"))
                 continue
-            grey = np.rint(255 * frame / max(frame.max(), 1)).astype(np.uint8)
-            pixels, ids = detector.detectBoard(grey)[:2]
-            if ids is not None and len(ids) >= MIN_CORNERS:
-                # its pixels have their centres at integers
-                views[camera, pose] = (
-                    np.ravel(ids),
-                    float64(pixels).reshape(-1, 2) + 0.5,
-                )
+            ids, pixels = _found(detector, frame)
+            if len(ids) >= MIN_CORNERS:
+                views[camera, pose] = ids, pixels
     for camera in set(cameras) - set(sizes):
         fields.fault("frames", f"must have pictures of {camera}", "none")
     require_none(faults)
@@ -110,6 +105,34 @@ def read_boards(folder: Path) -> Boards:
         [found[:, 0] - middle[0], middle[1] - found[:, 1], 0 * found[:, 2]], axis=1
     )
     return Boards(corners, views, sizes)
+
+
+def board_corners(board: Mapping[str, Any], frame: Frame) -> tuple[Index, Float64]:
+    """Corners, and their pixels (n, 2), of the board of a boards.json in a picture."""
+    names = ("squares", "square", "marker")
+    described = {name: board[name] for name in names}
+    dictionary = str(board.get("dictionary", DICTIONARY))
+    printed = printed_board(**described, dictionary=dictionary)
+    return _found(opencv(Path(FILE)).aruco.CharucoDetector(printed), frame)
+
+
+def _found(detector: Any, frame: Frame) -> tuple[Index, Float64]:
+    grey = float64(frame).mean(axis=2)
+    values = np.rint(255 * grey / max(grey.max(), 1)).astype(np.uint8)
+    pixels, ids = detector.detectBoard(values)[:2]
+    if ids is None:
+        return np.empty(0, int), np.empty((0, 2))
+    # its pixels have their centres at integers
+    return np.ravel(ids), float64(pixels).reshape(-1, 2) + 0.5
+
+
+def printed_board(
+    squares: Sequence[int], square: float, marker: float, dictionary: str
+) -> Any:
+    """The ChArUco board of OpenCV with these numbers of squares, sizes in mm."""
+    aruco = opencv(Path("board")).aruco
+    markers = aruco.getPredefinedDictionary(getattr(aruco, dictionary))
+    return aruco.CharucoBoard(tuple(squares), square, marker, markers)
 
 
 def calibrate_cameras(boards: Boards) -> dict[str, CalibratedCamera]:

@@ -2,7 +2,8 @@
 highlights on a mirror ball, and their application to a capture.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -11,6 +12,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 from scipy import ndimage
+from scipy.optimize import least_squares
 
 from skindb.calibration._merge_kernels import OK, SATURATED
 from skindb.calibration.frame_checks import checked_white_view
@@ -25,18 +27,26 @@ from skindb.calibration.irradiance import (
 )
 from skindb.calibration.radiance import FrameMerger, frame_mergers
 from skindb.calibration.setup import PLACE, BallFrames, of_devices
-from skindb.errors import Fault, InputError, attempt, attempt_all, input_error, require
+from skindb.errors import (
+    Fault,
+    InputError,
+    attempt,
+    attempt_all,
+    few_names,
+    input_error,
+    require,
+)
 from skindb.format.dome import (
     CameraRecord,
     DomeRecord,
     LightRecord,
     WhiteRecord,
 )
-from skindb.format.frames import CAMERA, LIGHT, filled, read_frame
+from skindb.format.frames import CAMERA, LIGHT, Frame, filled, read_frame
 from skindb.geometry.camera import Pinhole
 from skindb.parameters import POSITION_ERROR_MM
 from skindb.schema import dataset
-from skindb.types import Float64, Mask, float64, lengths
+from skindb.types import Float64, Mask, float64, lengths, unit
 
 # of the contrast over the ball; pixels above it belong to the highlight
 HIGHLIGHT_FRACTION = 0.5
@@ -51,6 +61,19 @@ OUTLINE_POINTS = 32  # lines of sight to the outline of a ball
 MAX_SIZE_MISMATCH = 0.05
 # of reweighting by distance; five change the position by less than a micrometre
 ROUNDS = 20
+MAX_PLACE_LIGHTS = (
+    24  # from which the places of a ball are found; each has six unknowns
+)
+BEHIND = (
+    0.0,
+    0.2,
+    0.4,
+    0.6,
+    0.8,
+    1.0,
+)  # radii: highlights on the front to those of its edge
+# median of the highlights: a pixel on a ball with a radius of 100 px turns a ray by 1.1 degrees
+MAX_MISS_DEGREES = 2.0
 # half diagonals of the target: light farther from its centre is not that of its blurred
 # corners
 BESIDE_TARGET = 1.05
@@ -60,6 +83,9 @@ SAME_POSITION_MM = 1.0
 SAME_ANGLE = float(np.radians(0.1))
 SAME_FRACTION = 0.8  # a few lamps may have failed
 MIN_SHARED = 3  # lights; one or two of two rigs may have the same places
+
+
+Highlights = dict[tuple[str, str], Float64]  # place, camera -> column and row, px
 
 
 @dataclass(frozen=True)
@@ -197,19 +223,106 @@ def reflected_ray(
     view = camera.rays(float64(highlight))
     centre = float64(ball)
     way = centre - camera.centre
-    along = float(way @ view)
-    square = float(way @ way)
-    under = radius**2 - square + along**2
+    point, direction, under = _mirrored(camera.centre, view, centre, radius)
     require(
-        under > 0 and along > 0,
+        under > 0 and way @ view > 0,
         "mirror ball",
         f"the line of sight must meet the ball of {radius:g} mm",
-        f"{np.sqrt(max(square - along**2, 0.0)):.1f} mm from its centre",
+        f"{np.sqrt(max(radius**2 - float(under), 0.0)):.1f} mm from its centre",
         "check the position of the ball",
     )
-    point = camera.centre + (along - np.sqrt(under)) * view
-    normal = (point - centre) / radius
-    return point, view - 2 * (view @ normal) * normal
+    return point, direction
+
+
+def _mirrored(
+    eye: Float64, view: Float64, ball: Float64, radius: float
+) -> tuple[Float64, Float64, Float64]:
+    """Points (..., 3) where lines of sight (..., 3) meet a ball, directions (..., 3) in which
+    it mirrors them, and the squares (...) of half of their lengths in it, negative for lines
+    that miss it, which are mirrored where they are nearest.
+    """
+    way = ball - eye
+    along = (view * way).sum(axis=-1)
+    under = radius**2 - (way * way).sum(axis=-1) + along**2
+    point = eye + (along - np.sqrt(np.maximum(under, 0)))[..., None] * view
+    normal = unit(point - ball)
+    out = view - 2 * (view * normal).sum(axis=-1)[..., None] * normal
+    return point, out, under
+
+
+def ball_places(
+    cameras: Mapping[str, Pinhole], highlights: Sequence[Highlights], radius: float
+) -> dict[str, Float64]:
+    """Centres (3,) mm of a ball of known radius at several places, from the highlights of
+    many lights: those for which the mirrored lines of sight of each light meet best.
+
+    Raises
+    ------
+    InputError
+        If fewer than two cameras see the highlights at a place, or the lines do not meet.
+    """
+    seen = [one for one in highlights if len(one) > 2]
+    seen = seen[:: -(-len(seen) // MAX_PLACE_LIGHTS) or 1]
+    start = dict[str, Float64]()
+    for place in sorted({place for one in seen for place, _ in one}):
+        views = defaultdict[str, list[Float64]](list)
+        for one in seen:
+            for (at, camera), pixel in one.items():
+                if at == place:
+                    views[camera].append(pixel)
+        require(
+            len(views) > 1,
+            f"mirror ball, place {place}",
+            "two cameras must see its highlights",
+            few_names(list(views)),
+            "move the ball to the middle of the dome, or give its outlines",
+        )
+        start[place] = light_position(
+            [cameras[camera].centre for camera in views],
+            [cameras[c].rays(np.median(p, axis=0)) for c, p in views.items()],
+        ).position
+    index = {place: i for i, place in enumerate(start)}
+    # eyes, lines of sight, and indices of the place
+    rays = [
+        (
+            np.array([cameras[camera].centre for _, camera in one]),
+            np.array([cameras[camera].rays(one[p, camera]) for p, camera in one]),
+            [index[place] for place, _ in one],
+        )
+        for one in seen
+    ]
+
+    def misses(x: Float64) -> Float64:
+        centres = x.reshape(-1, 3)
+        apart = []
+        for eye, view, places in rays:
+            point, out, _ = _mirrored(eye, view, centres[places], radius)
+            try:
+                light = light_position(point, out).position
+            except InputError:  # they are parallel far from the solution
+                light = point - out
+            apart.append(unit(light - point) - out)
+        return np.concatenate(apart).ravel()
+
+    if not start:
+        return {}
+    # the lines to the highlights meet before the centre
+    eyes = np.array([camera.centre for camera in cameras.values()])
+    front = np.array([*start.values()])
+    back = np.array([unit(centre - eyes).mean(axis=0) for centre in front])
+    starts = [(front + part * radius * back).ravel() for part in BEHIND]
+    best = min(starts, key=lambda x: float(np.abs(misses(x)).sum()))
+    fit = least_squares(misses, best, loss="soft_l1", f_scale=0.01)
+    miss = np.degrees(np.median(lengths(fit.fun.reshape(-1, 3))))
+    require(
+        miss <= MAX_MISS_DEGREES,
+        "mirror ball",
+        f"its highlights must agree with a ball of radius {radius:g} mm within "
+        f"{MAX_MISS_DEGREES:g} degrees",
+        f"{miss:.1f}",
+        "give the radius of the ball in mm, and remove other bright things from the pictures",
+    )
+    return dict(zip(start, fit.x.reshape(-1, 3), strict=True))
 
 
 def ball_centre(
@@ -573,8 +686,14 @@ def calibrate_positions(dome: DomeRecord, ball: BallFrames) -> xr.Dataset:
     cameras = {camera.id: camera for camera in dome.cameras}
     centres = dict[str, Float64]()
     faults = list[Fault]()
+    with ThreadPoolExecutor(THREADS) as pool:
+        highlights = attempt_all(
+            faults, partial(_highlights, dome, ball), dome.lights, pool=pool
+        )
     for place, circles in ball.outlines.items():
         views = [cameras[name] for name in circles]
+        if not views:
+            continue
         centre = attempt(
             faults,
             partial(ball_centre, views, list(circles.values()), ball.radius),
@@ -583,9 +702,15 @@ def calibrate_positions(dome: DomeRecord, ball: BallFrames) -> xr.Dataset:
         if centre is None:
             raise InputError(faults)
         centres[place] = centre
+    centres = centres or ball_places(cameras, highlights, ball.radius)
+    of_light = dict(zip(dome.light_ids, highlights, strict=True))
 
     def calibrated(light: LightRecord) -> tuple[LightPosition, int]:
-        rays = list(_rays(dome, ball, centres, light))
+        rays = [
+            reflected_ray(cameras[camera], centres[place], ball.radius, pixel)
+            for (place, camera), pixel in of_light[light.id].items()
+            if place in centres
+        ]
         require(
             len(rays) >= 2,
             "mirror ball",
@@ -617,27 +742,31 @@ def calibrate_positions(dome: DomeRecord, ball: BallFrames) -> xr.Dataset:
     )
 
 
-def _rays(
-    dome: DomeRecord,
-    ball: BallFrames,
-    centres: Mapping[str, Float64],
-    light: LightRecord,
-) -> Iterator[tuple[Float64, Float64]]:
-    """Points of the ball, and directions from them to the light, of all frames that
-    show its highlight.
-    """
+def _highlights(dome: DomeRecord, ball: BallFrames, light: LightRecord) -> Highlights:
+    """Highlights of a light, in the outline of the ball or, without any, in the whole picture."""
+    found: Highlights = {}
     for place, circles in ball.outlines.items():
         for camera in dome.cameras:
-            if camera.id not in circles:
+            if circles and camera.id not in circles:
                 continue
             names = {PLACE: place, LIGHT: light.id, CAMERA: camera.id}
             file = ball.folder / filled(ball.frames, **names)
             frame = read_frame(file, camera.sensor.kind)
-            column, row, radius = circles[camera.id]
-            outline = Outline(np.array([column, row]), radius)
-            highlight = attempt([], partial(highlight_centre, frame, outline))
+            highlight = highlight_of(camera, frame, circles.get(camera.id))
             if highlight is not None:
-                yield reflected_ray(camera, centres[place], ball.radius, highlight)
+                found[place, camera.id] = highlight
+    return found
+
+
+def highlight_of(
+    camera: CameraRecord, frame: Frame, circle: Float64 | None = None
+) -> Float64 | None:
+    """Highlight in the outline (3,) of a ball, or in the whole picture; None without one."""
+    if circle is None:
+        size = np.array([camera.width, camera.height])
+        circle = np.array([*size / 2, np.linalg.norm(size)])
+    outline = Outline(circle[:2], circle[2])
+    return attempt([], partial(highlight_centre, frame, outline))
 
 
 def positioned_dome(

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -47,24 +48,35 @@ KINDS = {
     "chart": {CAMERA, EXPOSURE},
 }
 PATCHES = 24  # of a ColorChecker
+CHART_COLUMNS = 6
+# radius inside a patch over the distance of patches: half of a patch that is seen at 60 degrees
+PATCH_FRACTION = 0.2
+WHITE_FRAMES = "dome/white/{exposure}/{light}_{camera}"  # without the suffix
 MIN_FLAT_FRAMES = 3  # of the flat field, for a meaningful estimate of the scatter
 
 
 def read_setup_dome(
-    folder: Path, *, white: bool = True, dark: bool = True
+    folder: Path,
+    *,
+    white: bool = True,
+    dark: bool = True,
+    record: Mapping[str, Any] | None = None,
 ) -> DomeRecord:
     """The dome of a set-up folder, which has no frames of a face; frames of a `white`
     target are required by default.
 
     Without `dark`, the dark frames and the sequence of the file are ignored, because a
-    session takes its own.
+    session takes its own. A `record` replaces the content of the file.
 
     Raises
     ------
     InputError
         With every fault of `dome/dome.json` and of the frames, or without a white target.
     """
-    fields = _read_fields(folder / "dome/dome.json")
+    file = folder / "dome/dome.json"
+    fields = (
+        _read_fields(file) if record is None else Fields(dict(record), str(file), [])
+    )
     if not dark:
         fields.data = {
             key: value
@@ -81,6 +93,35 @@ def read_setup_dome(
         )
     require_none(fields.faults)
     return dome
+
+
+def with_placeholders(record: Mapping[str, Any]) -> dict[str, Any]:
+    """The content of a dome.json whose geometry is not measured, with any geometry: cameras
+    at one place, all lights at another, and the white target in the holder of the board.
+
+    Values that cannot be read stay as they are.
+    """
+    filled_in = dict(record)
+    for key in ("cameras", "lights"):
+        items = record.get(key)
+        if isinstance(items, list):
+            filled_in[key] = [
+                _PLACEHOLDERS[key] | item if isinstance(item, dict) else item
+                for item in items
+            ]
+    if isinstance(white := record.get("white"), dict):
+        filled_in["white"] = {"point": [0, 0, 0], "normal": [0, 0, 1]} | white
+    return filled_in
+
+
+_PLACEHOLDERS: dict[str, dict[str, Any]] = {
+    "cameras": {
+        "K": [[1000, 0, 0], [0, 1000, 0], [0, 0, 1]],
+        "R": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+        "t": [0, 0, 1000],
+    },
+    "lights": {"position": [0, 0, 1000]},
+}
 
 
 def _read_fields(file: Path) -> Fields:
@@ -144,7 +185,7 @@ class BallFrames:
     """Frames of a mirror ball: one for each place of the ball, light, and camera with an outline.
 
     `radius` is that of the ball in mm. `outlines` are, by place and camera, column, row
-    and radius (3,) in px.
+    and radius (3,) in px; if all are empty, the highlights of all lights give its places.
     """
 
     folder: Path
@@ -229,19 +270,48 @@ def _camera_frames(dome: DomeRecord, item: Fields, key: str) -> CameraFrames:
     """The frames of one kind."""
     needed = KINDS[key]
     repeats = 1
+    radius = 0.0
     if REPEAT in needed:
         repeats = item.integer("repeats", minimum=2, maximum=MAX_REPEATS)
     places = {camera.id: np.empty((0, 2)) for camera in dome.cameras}
     is_chart = key == "chart"
-    if is_chart:
+    if is_chart and item.has("pitch"):
+        places, radius = _chart_in_holder(dome, item.number("pitch", above=0.0))
+    elif is_chart:
         places = _places(dome, item)
+        radius = item.number("radius", above=0.0)
     return CameraFrames(
         frames=_template(dome, item, "frames", needed),
         repeats=repeats,
         white=_template(dome, item, "white", needed) if is_chart else "",
-        radius=item.number("radius", above=0.0) if is_chart else 0.0,
+        radius=radius,
         places=places,
     )
+
+
+def chart_places(pitch: float) -> Float64:
+    """Centres (24, 3) mm of the patches of a chart in the holder, whose patches are so far
+    apart, row by row from the top.
+    """
+    row, column = np.divmod(np.arange(PATCHES), CHART_COLUMNS)
+    middle = (PATCHES / CHART_COLUMNS - 1) / 2
+    x = (column - (CHART_COLUMNS - 1) / 2) * pitch
+    return np.stack([x, (middle - row) * pitch, np.zeros(PATCHES)], axis=1)
+
+
+def _chart_in_holder(
+    dome: DomeRecord, pitch: float
+) -> tuple[dict[str, Float64], float]:
+    """Patches in the picture of every camera that sees all of them, and a radius in px."""
+    places = dict[str, Float64]()
+    radius = np.inf
+    for camera in dome.cameras:
+        place = camera.project(chart_places(pitch))
+        if ((place > 0) & (place < (camera.width, camera.height))).all():
+            places[camera.id] = place
+            width = camera.pixel_width(np.zeros(3))
+            radius = min(radius, PATCH_FRACTION * pitch / width)
+    return places, radius
 
 
 def _template(dome: DomeRecord, item: Fields, key: str, needed: set[str]) -> str:
@@ -300,13 +370,17 @@ def _known_points(dome: DomeRecord, item: Fields) -> dict[str, KnownPoints]:
 def _ball_frames(dome: DomeRecord, item: Fields) -> BallFrames:
     """The key "ball"."""
     template = _template(dome, item, "frames", {PLACE, LIGHT, CAMERA})
-    places = item.object("outlines")
     outlines = dict[str, dict[str, Float64]]()
-    if places.at_most(MAX_BALL_PLACES, "places of the ball"):
-        for place in places.data:
-            outlines[place] = _outlines(dome, places.object(place))
+    if item.has("outlines"):
+        places = item.object("outlines")
+        if places.at_most(MAX_BALL_PLACES, "places of the ball"):
+            for place in places.data:
+                outlines[place] = _outlines(dome, places.object(place))
+    else:
+        count = item.integer("places", minimum=2, maximum=MAX_BALL_PLACES)
+        outlines = {str(i + 1): {} for i in range(count)}
     radius = item.number("radius", above=0.0, maximum=MAX_BALL_RADIUS_MM)
-    item.require_known("its keys are frames, radius and outlines")
+    item.require_known("its keys are frames, radius, and outlines or places")
     return BallFrames(dome.folder, template, radius, outlines)
 
 

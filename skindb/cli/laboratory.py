@@ -38,15 +38,24 @@ def capture(
     seizures. Triggers and frames are counted, and missing frames are repeated while the
     subject is present. The same command continues a capture that ended early.
 
+    With --calibration, a calibration target is recorded in place of a subject, into OUT,
+    which is the folder that skindb calibrate reads.
+
     With --virtual, emulated devices and a virtual subject replace the laboratory; the
     files of the virtual subject are kept in OUT.virtual, which may be deleted. With
     --virtual and --setup, the emulated cameras deliver the frames of the capture that
     --setup names, for example one of your own dome.
     """
     ask = None if parameters.virtual or yes else _ask
+    if only_plan and parameters.calibration:
+        raise click.UsageError("--plan belongs to the capture of a subject")
     if only_plan:
         plan, lines = workflow.plan_session(out, parameters, progress=bar())
         emit(plan, lines)
+        return
+    if parameters.calibration:
+        recorded = workflow.record_target(out, parameters, ask=ask, progress=bar())
+        emit(recorded, _recording_lines(recorded))
         return
     report = workflow.capture_session(out, parameters, ask=ask, progress=bar())
     count = report["flashes_per_second"]
@@ -65,9 +74,22 @@ def capture(
     )
 
 
-def _ask(site: str, number: int) -> None:
+def _recording_lines(report: Json) -> list[str]:
+    """What a recording of a calibration target has, one line each."""
+    places = report["places"]
+    at = f" at {places} places" if places > 1 else ""
+    lines = [f"{report['path']}: {report['frames']} frames of {report['kind']}{at}"]
+    if rms := report.get("rms_px"):
+        worst = max(rms, key=rms.get)
+        lines.append(
+            f"corners are {rms[worst]:.2f} px (rms) or less from projections ({worst})"
+        )
+    return [*lines, *report["notes"]]
+
+
+def _ask(request: str) -> None:
     try:
-        wait_for_enter(f"Place the probe on {site} ({number}), then press Enter")
+        wait_for_enter(f"{request}, then press Enter")
     except click.Abort:
         # the session keeps and reports what it has recorded
         raise KeyboardInterrupt from None

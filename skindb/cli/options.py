@@ -8,7 +8,7 @@ from dataclasses import MISSING, Field, fields
 from functools import wraps
 from pathlib import Path
 from types import UnionType
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import click
 from click.core import ParameterSource
@@ -170,7 +170,7 @@ def _kind(hint: Any, limits: Option, default: Any) -> Json:
         return {"type": WordOrNumber(hint, limits)}
     if words_of(hint) and bool in get_args(hint):
         return {"type": Switch(words_of(hint))}
-    kind = get_args(hint)[0] if isinstance(hint, UnionType) else hint
+    kind = get_args(hint)[0] if get_origin(hint) in (Union, UnionType) else hint
     if kind is bool and default is True:  # the option switches it off
         return {"is_flag": True, "flag_value": False, "show_default": False}
     if kind is bool:

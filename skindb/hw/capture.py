@@ -144,7 +144,7 @@ def run_capture(
         kept), or if the folder holds an unfinished capture of another subject or under
         other conditions.
     """
-    _require_devices(setup, devices, plan)
+    require_devices(setup, devices, plan)
     session = open_unfinished(out, identity(setup, subject))
     schedule = planned_schedule(setup, plan)
     light = marker_light(setup.dome)
@@ -234,7 +234,8 @@ def _keep_interrupted(session: Unfinished, setup: Setup, devices: Devices) -> li
     ]
 
 
-def _require_devices(setup: Setup, devices: Devices, plan: CapturePlan) -> None:
+def require_devices(setup: Setup, devices: Devices, plan: CapturePlan) -> None:
+    """Require every light and camera of a set-up, and a probe if the plan has sites."""
     faults = []
     dome = devices.dome
     for where, kind, needed, present, cure in (
@@ -275,7 +276,7 @@ def _measure_sites(
     complete = {(entry["site"], entry["number"]) for entry in session.sites}
     for site, number in product(plan.sites, range(1, plan.placements + 1)):
         for attempt in range(ATTEMPTS if (site, number) not in complete else 0):
-            # `_require_devices` asserts it
+            # `require_devices` asserts it
             assert devices.probe is not None
             assert devices.probe_camera is not None
             try:

@@ -331,7 +331,7 @@ def keep_frames(session: Unfinished, run: DomeRun, setup: Setup) -> None:
             name = FRAMES.format(
                 exposure=step.exposure, light=step.light, camera=camera
             )
-            _copy(run.frames[camera, i], session.folder / f"{name}{suffix}")
+            copy_frame(run.frames[camera, i], session.folder / f"{name}{suffix}")
         entry = sequence_entry(step, measured)
         added.append(entry | {key: entry[key] + offset for key in ("t_on", "t_off")})
     _keep_dark_frames(session.folder, run, setup.dome.cameras, suffix)
@@ -345,7 +345,7 @@ def keep_site(session: Unfinished, run: SiteRun, number: int) -> None:
     """Copy the frames of one placement of the probe, and record it in `unfinished.json`."""
     suffix = next(iter(run.frames.values())).suffix
     for exposure, path in run.frames.items():
-        _copy(
+        copy_frame(
             path,
             session.folder
             / f"{SITE_FRAMES.format(site=run.site, exposure=exposure, placement=number)}{suffix}",
@@ -389,7 +389,7 @@ def _keep_dark_frames(
 def _write_mean(paths: Sequence[Path], target: Path, kind: FrameKind) -> None:
     """Write the mean of those frames that can be decoded."""
     if len(paths) == 1 or is_linear(paths[0]):
-        _copy(paths[0], target)
+        copy_frame(paths[0], target)
         return
     frames = list[Frame]()
     for path in paths:
@@ -427,7 +427,7 @@ def write_capture(
         record["rehearsal"] = {"person_present": False, "flashes_per_second": flashes}
     for key, path in files.items():
         name = f"scan{path.suffix}" if key == "mesh" else f"{key}{path.suffix}"
-        _copy(path, out / name)
+        copy_frame(path, out / name)
         record[key] = name
     dome = {
         key: value
@@ -448,12 +448,12 @@ def write_capture(
     }
     # every capture has its own frames of the white target
     for file in setup.dome.frame_files("white"):
-        _copy(file, out / file.relative_to(setup.folder))
-    _dump(out / "dome/dome.json", dome)
+        copy_frame(file, out / file.relative_to(setup.folder))
+    write_record(out / "dome/dome.json", dome)
     if session.sites and setup.probe is not None:
         _write_probe(session, setup.probe)
         record["contact"] = "contact/probe.json"
-    _dump(out / "capture.json", record)
+    write_record(out / "capture.json", record)
     (out / UNFINISHED).unlink()
 
 
@@ -498,14 +498,16 @@ def _write_probe(session: Unfinished, probe: Mapping[str, Any]) -> None:
             for site, entries in placements.items()
         },
     }
-    _dump(session.folder / "contact/probe.json", record)
+    write_record(session.folder / "contact/probe.json", record)
 
 
-def _copy(path: Path, target: Path) -> None:
+def copy_frame(path: Path, target: Path) -> None:
+    """Copy a file, and make the folder of the copy."""
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(path, target)
 
 
-def _dump(path: Path, record: Mapping[str, Any]) -> None:
+def write_record(path: Path, record: Mapping[str, Any]) -> None:
+    """Write a JSON file, and make its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(record, indent=1), encoding="utf-8")

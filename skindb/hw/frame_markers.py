@@ -268,7 +268,8 @@ def _problem(
         if not picture.is_even:  # noise is never equal
             return f"{files} are the same picture"
         if not all(names[j].startswith(f"light {DARK} ") for j in (before, i)):
-            return f"{files} are equally black; set a black level above zero"
+            cure = "set a black level above zero, or shorten the exposures"
+            return f"{files} are equally black or white; {cure}"
     return ""
 
 

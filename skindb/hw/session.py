@@ -333,7 +333,10 @@ def require_complete(run: DomeRun, cameras: Sequence[str]) -> None:
     InputError
         With the frames to repeat, the lights that failed, and why the sequence was stopped.
     """
-    cure = "keep the subject seated and run the capture again; it resumes with the missing steps"
+    cure = (
+        "keep the subject or target in place and run the capture again; it resumes with the "
+        "missing steps"
+    )
     faults = (
         [Fault("capture", "must run to its end", run.stopped, cure)]
         if run.stopped

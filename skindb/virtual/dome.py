@@ -330,7 +330,7 @@ def photograph(
                 images[i] += gloss[i] * polariser_factor(
                     view, light.position, both, surface.eta
                 )
-        writer = _FrameWriter(folder, camera, sensor, pattern, stream)
+        writer = FrameWriter(folder, camera, sensor, pattern, stream)
         for light, image in zip(dome.lights, images, strict=True):
             writer.write(FRAMES, light.name, image)
         writer.write(DARK, "", np.zeros_like(pattern), averaged=DARK_AVERAGE)
@@ -349,7 +349,7 @@ def photograph(
 
 
 @dataclass(frozen=True)
-class _FrameWriter:
+class FrameWriter:
     """Exposes radiance images with one camera and writes the files."""
 
     folder: Path
@@ -368,15 +368,19 @@ class _FrameWriter:
         a2, a4, a6 = camera.vignette
         return np.asarray(1 + r2 * (a2 + r2 * (a4 + r2 * a6)), np.float32)[..., None]
 
+    def exposed(
+        self, radiance: Image, seconds: float, *, averaged: int = 1
+    ) -> Values16:
+        """A frame of a radiance image."""
+        image = radiance * self.gain * np.float32(seconds)
+        return self.sensor.expose(image, self.pattern, averaged=averaged, rng=self.rng)
+
     def write(
         self, template: str, light: str, radiance: Image, *, averaged: int = 1
     ) -> None:
         """Write the exposures of one view."""
         for exposure, seconds in zip(EXPOSURES, SECONDS, strict=True):
-            image = radiance * self.gain * np.float32(seconds)
-            frame = self.sensor.expose(
-                image, self.pattern, averaged=averaged, rng=self.rng
-            )
+            frame = self.exposed(radiance, seconds, averaged=averaged)
             names = {"exposure": exposure, "light": light, "camera": self.camera.name}
             write_png(self.folder / template.format(**names), frame)
 

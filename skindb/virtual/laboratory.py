@@ -26,6 +26,8 @@ from skindb.virtual.devices import (
     EmulatedDome,
     EmulatedProbe,
 )
+from skindb.virtual.dome import write_png
+from skindb.virtual.targets import TargetScene
 
 PROBABILITIES = ("garbage", "lost_replies")  # of `DeviceFaults`
 MAX_FAULT = 1e6  # of any number of a fault
@@ -59,6 +61,9 @@ class Laboratory:
         Simulated faults.
     clock
         Clock of the devices; by default a simulated one.
+    scene
+        Calibration targets, which the cameras see in place of the subject; of the folder,
+        only dome/dome.json is used then.
     """
 
     def __init__(
@@ -68,7 +73,9 @@ class Laboratory:
         faults: LaboratoryFaults | None = None,
         *,
         clock: Clock | None = None,
+        scene: TargetScene | None = None,
     ) -> None:
+        self.scene = scene
         self.subject = subject
         self.watched = watched
         self.clock = clock or SimulatedClock()
@@ -141,6 +148,9 @@ class Laboratory:
     def _expose(
         self, target: Path, camera: str, exposure: str, factors: dict[str, float]
     ) -> None:
+        if self.scene is not None:
+            write_png(target, self.scene.frame(camera, exposure, factors))
+            return
         dark = self._source("dark", camera, exposure)
         if [*factors.values()] == [1.0]:
             source = self._required(camera, exposure, next(iter(factors)))

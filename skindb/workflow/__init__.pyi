@@ -50,6 +50,7 @@ from .pictures import (
     view_takes,
 )
 from .quicklook import quick
+from .recordings import record_target
 from .rig import calibrate_rig, describe_rig
 from .session import capture_session, check_device, plan_session
 from .simulation import begin_simulation, simulate
@@ -108,6 +109,7 @@ __all__ = [
     "plan_withdrawal",
     "quick",
     "record_consent",
+    "record_target",
     "refresh",
     "register_scan",
     "register_takes",

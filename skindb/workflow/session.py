@@ -43,7 +43,7 @@ FILES = {"mesh": "scan", "landmarks": "landmarks", "regions": "regions"}
 PLAN_NEEDS = ("setup",)
 SESSION_NEEDS = ("setup", "dome", "cameras", "subject", "consent", "reference", "scan")
 VIRTUAL_SIZE: Json = {"cameras": 4, "lights": 24, "width": 160, "height": 200}
-Ask = Callable[[str, int], None]
+Ask = Callable[[str], None]
 
 
 def plan_session(
@@ -123,8 +123,7 @@ def capture_session(
     parameters
         The laboratory, the subject and the sequence.
     ask
-        Called with site and number before each placement of the probe; returns when the
-        probe is placed.
+        Called with a request before each placement of the probe; returns when it is done.
     progress
         Called with the stage, the number of finished steps and the total number of steps.
 
@@ -141,13 +140,13 @@ def capture_session(
         plan = _plan(setup, parameters)
         files = _files(parameters, laboratory)
         read_scan(files["mesh"])
-        devices = _devices(setup, plan, parameters, laboratory)
+        devices = connected_devices(setup, plan, parameters, laboratory)
 
         def place(site: str, number: int) -> None:
             if laboratory is not None:
                 laboratory.place(site)
             elif ask is not None:
-                ask(site, number)
+                ask(f"Place the probe on {site} ({number})")
 
         return run_capture(
             out,
@@ -169,9 +168,9 @@ def _require_parameters(parameters: SessionParameters, needed: Iterable[str]) ->
     `needed` are those that a session in a real laboratory cannot do without.
     """
     faults = (
-        _rehearsal_faults(parameters)
+        rehearsal_faults(parameters)
         if parameters.virtual
-        else _real_session_faults(parameters, needed)
+        else real_session_faults(parameters, needed)
     )
     for site in _names(parameters.sites):
         if not re.fullmatch(IDENTIFIER.pattern, site):
@@ -190,7 +189,7 @@ def _require_parameters(parameters: SessionParameters, needed: Iterable[str]) ->
     require_none(faults)
 
 
-def _rehearsal_faults(parameters: SessionParameters) -> list[Fault]:
+def rehearsal_faults(parameters: SessionParameters) -> list[Fault]:
     """Parameters that contradict a rehearsal."""
     cure = "omit one of them"
     faults = [
@@ -210,7 +209,7 @@ def _rehearsal_faults(parameters: SessionParameters) -> list[Fault]:
     return faults
 
 
-def _real_session_faults(
+def real_session_faults(
     parameters: SessionParameters, needed: Iterable[str]
 ) -> list[Fault]:
     """Parameters that a real session lacks, or that belong to a rehearsal."""
@@ -260,7 +259,7 @@ def _subject_faults(parameters: SessionParameters) -> list[Fault]:
         {"scope": [NECESSARY_SCOPE], "reference": parameters.reference or "-"},
         parameters.condition,
         traits,
-        parameters.calibration or "",
+        parameters.calibrated_by or "",
     )
     return faults + [
         replace(fault, cure="correct the option")
@@ -313,7 +312,7 @@ def _plan(setup: Setup, parameters: SessionParameters) -> CapturePlan:
         parameters.seconds,
         parameters.slower,
         sites=sites,
-        placements=parameters.placements,
+        placements=parameters.placements or 1,
     )
 
 
@@ -343,7 +342,7 @@ def _subject(parameters: SessionParameters, laboratory: Laboratory | None) -> Su
         consent,
         parameters.condition,
         {**record["traits"], **_traits(parameters.traits)},
-        parameters.calibration or "",
+        parameters.calibrated_by or "",
         "" if laboratory is None else laboratory.subject.name,
     )
 
@@ -380,7 +379,7 @@ def _files(
 
 
 @contextmanager
-def _devices(
+def connected_devices(
     setup: Setup,
     plan: CapturePlan,
     parameters: SessionParameters,

@@ -17,6 +17,7 @@ from skindb.calibration.lights import (
     Outline,
     ball_centre,
     ball_outline,
+    ball_places,
     calibrate_positions,
     distant_light,
     highlight_centre,
@@ -354,6 +355,29 @@ def test_ball_centre__from_one_and_from_two_cameras(outlines):
         # the outline is known to a tenth of 37 px: 0.3 % of 900 mm along the view, 0.1 mm across it
         np.testing.assert_allclose(one, centre, atol=3)
         np.testing.assert_allclose(two, centre, atol=0.3)
+
+
+def test_ball_places__from_highlights_alone(pictures):
+    cameras = {
+        name: Pinhole(*(np.array(c[key]) for key in ("K", "R", "t")), np.zeros(5))
+        for name, c in CAMERAS.items()
+    }
+    whole = Outline(np.array([180.0, 90.0]), 400.0)
+    highlights = [
+        {
+            (place, name): highlight_centre(pictures[place, light, name], whole)
+            for place in PLACES
+            for name in CAMERAS
+        }
+        for light in LIGHTS
+    ]
+    found = ball_places(cameras, highlights, RADIUS)
+    for place, centre in PLACES.items():
+        # as by outlines: highlights are known to a tenth of a pixel of 0.8 mm
+        np.testing.assert_allclose(found[place], centre, atol=0.5)
+    one = [{key: at for key, at in h.items() if key[1] == "c0"} for h in highlights]
+    with pytest.raises(InputError, match="two cameras must see its highlights"):
+        ball_places(cameras, [one[0] | {("b", "c1"): np.zeros(2)}], RADIUS)
 
 
 def test_calibrate_positions__skips_frames_without_a_highlight(setup, pictures):
