@@ -39,7 +39,7 @@ from skindb.types import Array, Index, Mask, Progress, dots, float64, lengths
 RAYS_PER_AXIS = 2
 RAYS_PER_AXIS_ENVIRONMENT = 4
 # for an estimate of the variance that can be compared with the target error
-MIN_BATCHES = 8
+MIN_BATCHES = 4
 LIGHTS_PER_RAY = 4  # lights drawn for each ray; with fewer lights, all are used
 CELLS = 16  # of normals along each axis
 # in probabilities, because normals of a cell differ by up to 0.1, and for the discs of
