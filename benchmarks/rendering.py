@@ -13,6 +13,7 @@ from __future__ import annotations
 import tempfile
 import time
 from dataclasses import replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -100,10 +101,9 @@ def by_samples(surface, camera, lighting, **options):
 
 def by_opening(surface, lighting):
     """Rows of opening, CPU time [s] of a tree walk, RMS difference from the sum over all pairs."""
-    from skindb.render.shading import (
-        exitance_from_irradiance,
-        transmitted_irradiance,
-    )
+    from skindb.geometry.mesh import vertex_areas
+    from skindb.optics.dipole_tree import subsurface_exitance
+    from skindb.render.shading import transmitted_irradiance
 
     scene = RayScene(surface.vertices, surface.faces)
     received = (
@@ -113,16 +113,22 @@ def by_opening(surface, lighting):
     receivers = np.zeros(len(surface.vertices), bool)
     # all pairs of all surfels would take hours
     receivers[:: max(len(receivers) // 2000, 1)] = True
+    carried = partial(
+        subsurface_exitance,
+        surface.vertices,
+        vertex_areas(surface.vertices, surface.faces),
+        received,
+        surface.s,
+        surface.sigma_tr,
+        eta=surface.eta,
+        receivers=receivers,
+    )
     started = time.process_time()
-    exact = exitance_from_irradiance(surface, received, receivers, tolerance=0.0)[
-        receivers
-    ]
+    exact = carried(tolerance=0.0)[:, receivers]
     yield 0.0, time.process_time() - started, 0.0
     for opening in OPENINGS:
         started = time.process_time()
-        exitance = exitance_from_irradiance(
-            surface, received, receivers, tolerance=opening
-        )[receivers]
+        exitance = carried(tolerance=opening)[:, receivers]
         error = np.sqrt(np.mean((exitance - exact) ** 2) / np.mean(exact**2))
         yield opening, time.process_time() - started, float(error)
 

@@ -10,7 +10,7 @@ import xarray as xr
 
 from skindb.render.image import auto_exposure, encode_srgb, shown_part, tone_map
 from skindb.render.photographs import Comparison, side_by_side
-from skindb.render.rendering import chosen_camera, radiance_of
+from skindb.render.rendering import chosen_camera, render
 from skindb.render.scene import from_model
 from skindb.render.shading import trace_view
 from skindb.schema import variables
@@ -24,6 +24,7 @@ ERRORS = (  # maps of residuals, black where they are unknown
 )
 # directions of the two lights of a portrait
 KEY_LIGHTS = ((-0.5, 0.35, 0.8), (0.55, 0.25, 0.8))
+SAMPLES = 16  # rays per pixel of a portrait
 MARGIN = 6  # pixels around a face
 
 
@@ -57,7 +58,8 @@ def portrait(model: xr.DataTree) -> Image:
     towards = unit(dome[variables.LIGHT_POSITION].values)
     nearest = np.argmax(unit(np.array(KEY_LIGHTS)) @ towards.T, axis=1)
     names = [str(dome["light"].values[i]) for i in nearest]
-    return radiance_of(model, lights=names, scale=1.6)
+    seen = render(model, lights=names, scale=1.6, samples=SAMPLES)
+    return np.asarray(seen["radiance"].values)
 
 
 def map_pictures(

@@ -4,7 +4,7 @@ without noise from the lights of its dome.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,20 +29,12 @@ from skindb.render.scene import (
     Environment,
     Lighting,
     Lights,
-    Surface,
     cameras_from_dome,
     from_model,
     lights_from_dome,
 )
 from skindb.render.shading import (
-    TERMS,
-    bounced_exitance,
-    escape_factor,
-    exitance_from_irradiance,
     require_translucency,
-    shade_view,
-    trace_view,
-    transmitted_irradiance,
     tree_opening,
 )
 from skindb.render.subsurface import refined_surface
@@ -60,79 +52,6 @@ UNITS = "radiance"  # in the unit of the photographs, or of the environment
 NO_LIGHTS = Lights(
     np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros(0)
 )
-
-
-def radiance_of(
-    model: xr.DataTree,
-    *,
-    lights: Sequence[str] = (),
-    camera: str | None = None,
-    samples: int = 2,
-    scale: float = 1.0,
-    subsurface: bool = False,
-    terms: Collection[str] = TERMS,
-) -> Float32:
-    """Radiance (h, w, 3) that a camera of the dome of a model sees, without noise.
-
-    Parameters
-    ----------
-    model
-        Version of kind "model" or "edit".
-    lights
-        Names of lights of the dome, whose light is summed; default all.
-    camera
-        Name of a camera of the dome; default the most frontal one.
-    samples
-        Rays per pixel and axis.
-    scale
-        Size of the picture relative to that of the camera.
-    subsurface
-        Whether diffuse light travels through the skin (dipole).
-    terms
-        Parts of the reflectance without subsurface light: "diffuse", "surface".
-    """
-    honour_consent(model.attrs, "export")
-    dome = model["dome"].to_dataset().load()
-    surface = from_model(model)
-    if subsurface:
-        require_translucency(surface)
-    seen_by = chosen_camera(dome, camera)[0].scaled(scale)
-    lamps = chosen_lights(dome, lights)[0]
-    return sum_over_lights(
-        surface,
-        lamps,
-        seen_by,
-        samples=samples,
-        subsurface=subsurface,
-        terms=terms,
-    )
-
-
-def sum_over_lights(
-    surface: Surface,
-    lamps: Lights,
-    camera: Camera,
-    *,
-    samples: int,
-    subsurface: bool,
-    terms: Collection[str] = TERMS,
-) -> Float32:
-    """Linear picture (h, w, 3) under all lights. Irradiances are summed before light travels
-    under the skin, as this is linear, and only visible surfels receive it.
-    """
-    scene = RayScene(surface.vertices, surface.faces)
-    view = trace_view(surface, camera, samples=samples, scene=scene)
-    terms = ("surface",) if subsurface else terms
-    direct = shade_view(view, surface, lamps, scene, terms=terms).sum(axis=0)
-    if subsurface:
-        received = transmitted_irradiance(surface, lamps, scene) @ lamps.intensity
-        shown = view.shown(len(surface.vertices))
-        glow = exitance_from_irradiance(surface, received, shown)
-        if surface.inter_reflection:
-            glow += bounced_exitance(surface, received)
-        escape = escape_factor(view, surface.eta)
-        direct += view.image(escape * view.interpolate(glow))
-    return np.asarray(direct, np.float32)
 
 
 def chosen_lights(dome: xr.Dataset, lights: Sequence[str]) -> tuple[Lights, list[str]]:

@@ -133,8 +133,22 @@ def exitances(
         (l, v, 3), valid for all cameras. The kernel is divided by its sum, so that
         uniform light gives exactly R_d.
     """
-    out = _exitances_from_irradiance(
-        surface, transmitted_irradiance(surface, lights, scene), receivers
+    if surface.s is None or surface.sigma_tr is None:
+        raise ValueError(
+            "the surface must have s and sigma_tr for subsurface transport, found None"
+        )
+    finite = finite_rows(surface.s) & finite_rows(surface.sigma_tr)
+    irradiance = transmitted_irradiance(surface, lights, scene)
+    out = np.zeros((len(lights), len(surface.vertices), 3), np.float32)
+    out[:, finite] = subsurface_exitance(
+        surface.vertices[finite],
+        vertex_areas(surface.vertices, surface.faces)[finite],
+        irradiance[finite],
+        surface.s[finite],
+        surface.sigma_tr[finite],
+        eta=surface.eta,
+        tolerance=DEFAULT_OPENING,
+        receivers=None if receivers is None else receivers[finite],
     )
     out *= lights.intensity[:, None].astype(np.float32)
     return out
@@ -163,50 +177,6 @@ def tree_opening(error: float | None) -> tuple[float, float]:
         else float(np.clip(error / 10 / ERROR_PER_OPENING, *OPENINGS))
     )
     return opening, ERROR_PER_OPENING * opening
-
-
-def exitance_from_irradiance(
-    surface: Surface,
-    received: Array,
-    receivers: Mask | None = None,
-    *,
-    tolerance: float = DEFAULT_OPENING,
-) -> Float32:
-    """Radiant exitance (v, 3) under the boundary at the receivers, from
-    irradiance (v, 3) under the boundary.
-    """
-    exitance = _exitances_from_irradiance(
-        surface, received, receivers, tolerance=tolerance
-    )
-    # each column is the light of one channel, so only this channel of its result is used
-    return np.stack([exitance[c, :, c] for c in range(3)], axis=-1)
-
-
-def _exitances_from_irradiance(
-    surface: Surface,
-    irradiance: Array,
-    receivers: Mask | None,
-    *,
-    tolerance: float = DEFAULT_OPENING,
-) -> Float32:
-    """Exitance (l, v, 3) at the receivers, 0 at the others, from irradiance (v, l)."""
-    if surface.s is None or surface.sigma_tr is None:
-        raise ValueError(
-            "the surface must have s and sigma_tr for subsurface transport, found None"
-        )
-    finite = finite_rows(surface.s) & finite_rows(surface.sigma_tr)
-    out = np.zeros((irradiance.shape[1], len(surface.vertices), 3), np.float32)
-    out[:, finite] = subsurface_exitance(
-        surface.vertices[finite],
-        vertex_areas(surface.vertices, surface.faces)[finite],
-        irradiance[finite],
-        surface.s[finite],
-        surface.sigma_tr[finite],
-        eta=surface.eta,
-        tolerance=tolerance,
-        receivers=None if receivers is None else receivers[finite],
-    )
-    return out
 
 
 @dataclass(frozen=True)

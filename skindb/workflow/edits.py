@@ -18,7 +18,7 @@ from skindb.files import plain
 from skindb.reflectance.dictionary import embedded_dictionary
 from skindb.reflectance.kinds import require_mixture
 from skindb.render.figures import write_grid
-from skindb.render.rendering import frontal_camera, radiance_of
+from skindb.render.rendering import frontal_camera, render
 from skindb.schema import variables
 from skindb.store import STUDY, Database, Record, require_fresh
 from skindb.types import Float32, Progress, lengths, silent
@@ -29,6 +29,7 @@ from skindb.workflow.derive import Derivation, derive
 from skindb.workflow.fit import dictionary_at
 
 GRID_SIDE = 320.0  # pixels, the longer side of a picture in a grid
+SAMPLES = 4  # rays per pixel of such a picture, of few lights
 LABEL_WIDTH = 26  # characters
 METHOD = (apply_traits, common_maps)  # functions that compute an edit
 STRENGTHS = (0.5, 1.0)  # of the edits in a grid, as in figure 19 of the paper
@@ -122,7 +123,7 @@ def edit_grid(
     progress
         Called with the stage, the number of finished steps and the total number of steps.
     **options
-        Of `skindb.render.rendering.radiance_of`: lights, by default the one nearest to
+        Of `skindb.render.render`: lights, by default the one nearest to
         the frontal camera, in which gloss shows most; camera, samples, subsurface, and
         scale, by default such that a picture's longer side has 320 pixels.
 
@@ -136,7 +137,7 @@ def edit_grid(
     db.require_consent(take, "export")
     options.setdefault("scale", _grid_scale(source.model))
     options.setdefault("lights", [_frontal_light(source.model)])
-    plain = radiance_of(source.model, **options)
+    plain = _radiance(source.model, **options)
     pictures = {}
     strongest = {}
     number = 0
@@ -148,7 +149,7 @@ def edit_grid(
             strongest[label] = source.move(
                 {name: strength * amount for name, amount in amounts.items()}
             )
-            pictures[label].append(radiance_of(strongest[label], **options))
+            pictures[label].append(_radiance(strongest[label], **options))
             number += 1
             progress("edits", number, steps)
     titles = [take, *(f"{strength:g} times the trait" for strength in strengths)]
@@ -186,7 +187,7 @@ def basis_grid(
     seed
         Random seed of the factorisations.
     **options
-        Of `skindb.render.rendering.radiance_of`.
+        Of `skindb.render.render`.
 
     Returns
     -------
@@ -213,8 +214,8 @@ def basis_grid(
     surfaces = []
     for name, mixture in mixtures.items():
         reduced_model = with_basis(model, mixture=mixture, names=names, tables=tables)
-        pictures[name] = radiance_of(reduced_model, **options)
-        surfaces.append(radiance_of(reduced_model, **options, terms=("surface",)))
+        pictures[name] = _radiance(reduced_model, **options)
+        surfaces.append(_radiance(reduced_model, **options, terms=("surface",)))
     rows = {take: [*pictures.values()], "surface alone": surfaces}
     write_grid(out, rows, list(pictures))
     *_, full = pictures.values()
@@ -222,6 +223,12 @@ def basis_grid(
         name: _root_mean_square(picture - full) / _root_mean_square(full)
         for name, picture in pictures.items()
     }
+
+
+def _radiance(model: DataTree, **options: Any) -> Float32:
+    """Picture (h, w, 3) of a grid."""
+    seen = render(model, **{"samples": SAMPLES, **options})
+    return np.asarray(seen["radiance"].values)
 
 
 def _root_mean_square(values: Float32) -> float:

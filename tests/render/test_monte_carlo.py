@@ -12,7 +12,9 @@ import trimesh
 from scipy import stats
 
 from skindb.errors import InputError
+from skindb.geometry.mesh import vertex_areas
 from skindb.optics.diffusion import dipole_s
+from skindb.optics.dipole_tree import subsurface_exitance
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.tables import TableGrid, directional_albedo, tabulate
@@ -26,7 +28,7 @@ from skindb.render.monte_carlo import (
     stratified,
 )
 from skindb.render.scene import Camera, Environment, Lighting, Lights, Surface
-from skindb.render.shading import exitance_from_irradiance, trace_view, tree_opening
+from skindb.render.shading import trace_view, tree_opening
 from tests.pictures import render_view
 
 LEVEL = 1e-5  # probability with which a right renderer fails a z-test of a picture
@@ -327,8 +329,12 @@ def test_tree_opening__costs_less_than_it_says(error) -> None:
     s, _ = dipole_s(surface.diffuse, eta=1.3)
     skin = replace(surface, s=s, sigma_tr=np.full(s.shape, [0.3, 0.7, 1.2]))
     received = np.maximum(surface.normals @ [[1.0], [0.2], [0]], 0) * np.ones((1, 3))
-    true = exitance_from_irradiance(skin, received, tolerance=1e-4)
-    found = exitance_from_irradiance(skin, received, tolerance=opening)
+    areas = vertex_areas(skin.vertices, skin.faces)
+    parts = (skin.vertices, areas, received, skin.s, skin.sigma_tr)
+    true, found = (
+        subsurface_exitance(*parts, eta=skin.eta, tolerance=tolerance)
+        for tolerance in (1e-4, opening)
+    )
     assert np.linalg.norm(found - true) / np.linalg.norm(true) < bound
 
 

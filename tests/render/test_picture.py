@@ -18,7 +18,6 @@ from skindb.render.rendering import (
     fixed_exposure,
     render,
     render_picture,
-    sum_over_lights,
 )
 from skindb.render.scene import (
     Lighting,
@@ -113,23 +112,6 @@ def test_render_picture__subsurface_names_the_channel_without_sigma_tr(
 
 
 @pytest.mark.parametrize("subsurface", [False, True])
-def test_picture__is_the_sum_over_the_lights(
-    model: xr.DataTree, subsurface: bool
-) -> None:
-    surface = from_model(model)
-    dome = model["dome"].to_dataset()
-    camera = cameras_from_dome(dome)[0].scaled(2.0)
-    lights = lights_from_dome(dome).select([0, 2])
-    together = sum_over_lights(
-        surface, lights, camera, samples=2, subsurface=subsurface
-    )
-    each = render_view(surface, camera, lights, samples=2, subsurface=subsurface)
-    assert each.max(axis=(1, 2, 3)).min() > 0
-    # float32, 256 surfels summed
-    np.testing.assert_allclose(together, each.sum(axis=0), rtol=1e-5)
-
-
-@pytest.mark.parametrize("subsurface", [False, True])
 def test_render_picture__plan_leaves_the_picture_the_same(
     model: xr.DataTree, tmp_path: Path, subsurface: bool
 ) -> None:
@@ -138,10 +120,6 @@ def test_render_picture__plan_leaves_the_picture_the_same(
     visible = shading.trace_view(surface, camera).shown(256)
     seen = int(visible.sum())
     assert 50 < seen < 200  # of 256: the square is larger than the picture
-    light = np.ones((256, 3))
-    everywhere = shading.exitance_from_irradiance(surface, light)
-    at_visible = shading.exitance_from_irradiance(surface, light, visible)
-    np.testing.assert_array_equal(everywhere[visible], at_visible[visible])
     told = render_picture(
         model, tmp_path / "a.exr", samples=8, subsurface=subsurface, explain=True
     )
@@ -164,30 +142,6 @@ def test_render_picture__plan_leaves_the_picture_the_same(
         >= told.items()
     )
     assert (tmp_path / "a.exr").is_file()
-
-
-def test_picture__all_lights_are_carried_as_three_columns(
-    model: xr.DataTree, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    columns = []
-
-    def counted(points, areas, irradiance, *rest, **options):
-        columns.append(irradiance.shape[1])
-        return carry(points, areas, irradiance, *rest, **options)
-
-    carry = shading.subsurface_exitance
-    monkeypatch.setattr(shading, "subsurface_exitance", counted)
-    model["dome"] = model["dome"].to_dataset().isel(light=[0, 1, 2, 0, 1])
-    surface = from_model(model)
-    dome = model["dome"].to_dataset()
-    sum_over_lights(
-        surface,
-        lights_from_dome(dome),
-        cameras_from_dome(dome)[0],
-        samples=1,
-        subsurface=True,
-    )
-    assert columns == [3]
 
 
 def test_compare_photographs__reads_the_half_floats_of_older_stores(

@@ -19,7 +19,6 @@ from skindb.optics.diffusion import dipole_s
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.render.monte_carlo import Quality, render_monte_carlo
 from skindb.render.photographs import compare_photographs
-from skindb.render.rendering import sum_over_lights
 from skindb.render.scene import (
     Camera,
     Environment,
@@ -99,11 +98,7 @@ def _monte_carlo(surface: Surface) -> np.ndarray:
     ).radiance
 
 
-def _under_the_skin(surface: Surface) -> np.ndarray:
-    return sum_over_lights(surface, _lamp(), _view(), samples=1, subsurface=True)
-
-
-@pytest.mark.parametrize("drawn", [_shaded, _monte_carlo, _under_the_skin])
+@pytest.mark.parametrize("drawn", [_shaded, _monte_carlo])
 def test_pictures__of_the_inside_of_a_sphere_are_the_closed_form(
     drawn, sphere: Surface
 ) -> None:
