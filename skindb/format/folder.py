@@ -33,7 +33,6 @@ from skindb.format.scan_checks import (
     coincidence_faults,
     crop_path,
     device_faults,
-    discarded_piece_faults,
     dome_unit_faults,
     face_faults,
     face_height,
@@ -193,7 +192,7 @@ class _Reader:
         mesh_file = self._path("mesh") if fields.has("mesh") else None
         self.mesh_place = f"{mesh_file} (mesh)"
         scan, surface = self._mesh(mesh_file)
-        landmarks = self._landmarks(scan, surface)
+        landmarks = self._landmarks(surface)
         regions = self._regions(scan, surface)
         self.dome = self._dome(surface)
         probe = self._object("contact", "no fibre profiles, no translucency")
@@ -438,9 +437,7 @@ class _Reader:
             )
             return surface
 
-    def _landmarks(
-        self, scan: Scan | None, surface: CleanMesh | None
-    ) -> dict[str, Point]:
+    def _landmarks(self, surface: CleanMesh | None) -> dict[str, Point]:
         missing = "population analysis by landmarks is not possible"
         fields = self._object("landmarks", missing)
         if fields is None:
@@ -456,23 +453,19 @@ class _Reader:
             for name, point in points.items()
             if fields.place(name) not in faulty
         }
-        if scan is not None and surface is not None and sound and not self.unit_faults:
-            self._check_landmarks(fields.where, sound, scan, surface)
+        if surface is not None and sound and not self.unit_faults:
+            self._check_landmarks(fields.where, sound, surface)
         return points
 
     def _check_landmarks(
-        self, where: str, points: Mapping[str, Point], scan: Scan, surface: CleanMesh
+        self, where: str, points: Mapping[str, Point], surface: CleanMesh
     ) -> None:
         """Record the first kind of fault that landmarks have."""
-        distant = landmark_faults(where, points, scan)
+        distant = landmark_faults(where, points, surface)
         if len(distant) > max(2, len(points) / 2):
             self.unit_faults += face_faults(where, points, on_scan=False) or distant
             return
-        faults = (
-            distant
-            or discarded_piece_faults(where, points, surface)
-            or coincidence_faults(where, points)
-        )
+        faults = distant or coincidence_faults(where, points)
         if not faults and not self._check_size(where, points):
             faults = order_faults(where, points) or swapped_faults(
                 where, points, surface

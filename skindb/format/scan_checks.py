@@ -19,7 +19,7 @@ from skindb.geometry.mesh import (
     vertex_normals,
     winding_number,
 )
-from skindb.geometry.scan import Crop, Scan
+from skindb.geometry.scan import Crop
 from skindb.types import Float64, lengths
 
 UNITS = {
@@ -130,45 +130,23 @@ def face_height(points: Mapping[str, Float64]) -> float | None:
 
 
 def landmark_faults(
-    where: str, points: Mapping[str, Float64], scan: Scan
-) -> list[Fault]:
-    """Faults of landmarks that are not on the scan."""
-    rule = f"a landmark must lie within {LANDMARK_REACH:g} mm of the scan"
-    cure = "mark it again, with scan and landmarks in mm and in one frame"
-    return [
-        Fault(f"{where}[{name}]", rule, f"{d:.1f} mm away", cure)
-        for name, d in _distances(points, scan).items()
-        if d > LANDMARK_REACH
-    ]
-
-
-def _distances(
-    points: Mapping[str, Float64], mesh: Scan | CleanMesh
-) -> dict[str, float]:
-    """Distance [mm] of each point from a mesh."""
-    positions = np.array([*points.values()]).reshape(-1, 3)
-    distances = closest_on_mesh(mesh.vertices, mesh.faces, positions)[2]
-    return dict(zip(points, distances, strict=True))
-
-
-def discarded_piece_faults(
     where: str, points: Mapping[str, Float64], surface: CleanMesh
 ) -> list[Fault]:
-    """Fault of landmarks on a component of the scan that cleaning removed, because
-    another one is larger.
-    """
-    distances = _distances(points, surface)
-    distant = [name for name, d in distances.items() if d > LANDMARK_REACH]
-    if not distant:
-        return []
+    """Faults of landmarks that are not on the part of the scan that is kept."""
+    rule = (
+        f"a landmark must lie within {LANDMARK_REACH:g} mm of the largest component of "
+        "the scan, which is kept"
+    )
+    cure = (
+        "mark it again, with scan and landmarks in mm and in one frame, and remove from "
+        "the scan what does not belong to this face"
+    )
+    positions = np.array([*points.values()]).reshape(-1, 3)
+    distances = closest_on_mesh(surface.vertices, surface.faces, positions)[2]
     return [
-        Fault(
-            where,
-            "landmarks must lie on the largest component of the scan, which is kept",
-            f"{len(distant)} of {len(points)} up to {max(distances.values()):.0f} mm from "
-            f"it, such as {distant[0]}",
-            "remove everything from the scan that does not belong to this face",
-        )
+        Fault(f"{where}[{name}]", rule, f"{d:.1f} mm away", cure)
+        for name, d in zip(points, distances, strict=True)
+        if d > LANDMARK_REACH
     ]
 
 

@@ -19,7 +19,6 @@ from skindb.format.fields import read_json
 from skindb.format.scan_checks import (
     coincidence_faults,
     crop_path,
-    discarded_piece_faults,
     face_faults,
     is_point,
     order_faults,
@@ -174,20 +173,19 @@ def landmark_mistakes(
             for name in unknown
         ]
     place = np.array([*points.values()])
-    distance = closest_on_mesh(task.scan.vertices, task.scan.faces, place)[2]
-    rule = f"a landmark must be within {MAX_OFF_SURFACE_MM:g} mm of the scan"
+    distance = closest_on_mesh(task.surface.vertices, task.surface.faces, place)[2]
+    rule = (
+        f"a landmark must be within {MAX_OFF_SURFACE_MM:g} mm of the scan, of which the "
+        "largest component is kept"
+    )
     faults = [
         Fault(f"{file}[{name}]", rule, f"a distance of {d:.1f} mm", "set it again")
         for name, d in zip(points, distance, strict=True)
         if d > MAX_OFF_SURFACE_MM
     ] + _outside(file, points, crop)
-    faults = (
-        faults
-        or discarded_piece_faults(file, points, task.surface)
-        or coincidence_faults(file, points)
-    )
     return (
         faults
+        or coincidence_faults(file, points)
         or [*face_faults(file, points), *order_faults(file, points)]
         or swapped_faults(file, points, task.surface)
     )
