@@ -26,6 +26,9 @@ MIN_CORNERS = 8  # in a picture
 MIN_POSES = 4  # of a camera; three determine it without a check
 # rms of a camera; OpenCV finds corners to 0.1 px in sharp pictures
 MAX_REPROJECTION_PX = 1.0
+CORNER_PX = 0.2  # typical error of a corner in a sharp picture
+# fraction of the radius by which k2 and k3 usually bend the edge of a picture
+MAX_BEND = 0.01
 FAR_PX = 1e4  # for points behind a camera, or beyond its distortion
 STEP = 1e-7  # of the finite differences: root of the precision, of at least 1
 OF_CAMERA, OF_POSE = 15, 6  # numbers: fx fy cx cy, distortion, rotation vector, t
@@ -180,6 +183,13 @@ def calibrate_cameras(boards: Boards) -> dict[str, CalibratedCamera]:
     ends = np.cumsum([2 * len(boards.views[view][0]) for view in views])
     rows = dict(zip(views, map(slice, [0, *ends[:-1]], ends), strict=True))
     pixels = np.concatenate([boards.views[view][1] for view in views]).ravel()
+    # k2 and k3 of each camera, and how far they may bend its picture before they cost as
+    # much as corners: otherwise noise bends a corner that no board has reached
+    bent = np.array([[parts[name].start + i for i in (5, 8)] for name in names])
+    reach = np.array(
+        [np.hypot(*boards.sizes[name]) / 2 / cameras[name][0] for name in names]
+    )
+    bends = CORNER_PX / MAX_BEND * np.stack([reach**4, reach**6], axis=1)
 
     def differences(x: Float64) -> Float64:
         projected = []
@@ -194,13 +204,15 @@ def calibrate_cameras(boards: Boards) -> dict[str, CalibratedCamera]:
             one = _pinhole(x[parts[name]])
             projected.append(one.project(np.concatenate(points)).ravel())
         apart = np.concatenate(projected) - pixels
-        return float64(np.where(np.isfinite(apart), apart, FAR_PX))
+        apart = np.where(np.isfinite(apart), apart, FAR_PX)
+        return float64(np.concatenate([apart, (bends * x[bent]).ravel()]))
 
     def slopes(x: Float64) -> Float64:
         """Finite differences; a row depends on one camera and one pose, so that numbers of
         different cameras, or poses, are changed at once.
         """
-        matrix = np.zeros((len(pixels), len(x)))
+        matrix = np.zeros((len(pixels) + bent.size, len(x)))
+        matrix[len(pixels) + np.arange(bent.size), bent.ravel()] = bends.ravel()
         here = differences(x)
         for count, begin, end in ((OF_CAMERA, 0, first), (OF_POSE, first, len(x))):
             for i in range(begin, begin + count):
@@ -241,7 +253,8 @@ def calibrate_cameras(boards: Boards) -> dict[str, CalibratedCamera]:
             if not value <= MAX_REPROJECTION_PX
         ]
     )
-    variance = float(fit.fun @ fit.fun) / (len(fit.fun) - len(x))
+    apart = fit.fun[: len(pixels)]
+    variance = float(apart @ apart) / (len(apart) - len(x))
     error = np.sqrt(variance * np.diagonal(np.linalg.inv(fit.jac.T @ fit.jac)))
     return {
         name: CalibratedCamera(
@@ -270,6 +283,7 @@ def _start(
             boards.sizes[camera],
             None,
             None,
+            flags=cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3,
         )
         single[camera] = np.array(
             [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *np.ravel(bent)[:5]]

@@ -314,12 +314,14 @@ def ball_places(
     best = min(starts, key=lambda x: float(np.abs(misses(x)).sum()))
     fit = least_squares(misses, best, loss="soft_l1", f_scale=0.01)
     miss = np.degrees(np.median(lengths(fit.fun.reshape(-1, 3))))
+    # balls of a wrong size fit best far away, where all lines are parallel
+    away = lengths(fit.x.reshape(-1, 3) - front).max()
     require(
-        miss <= MAX_MISS_DEGREES,
+        miss <= MAX_MISS_DEGREES and away <= 2 * radius,
         "mirror ball",
         f"its highlights must agree with a ball of radius {radius:g} mm within "
         f"{MAX_MISS_DEGREES:g} degrees",
-        f"{miss:.1f}",
+        f"{miss:.1f} degrees, {away:.0f} mm from where the lines to them meet",
         "give the radius of the ball in mm, and remove other bright things from the pictures",
     )
     return dict(zip(start, fit.x.reshape(-1, 3), strict=True))

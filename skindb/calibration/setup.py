@@ -249,7 +249,7 @@ def read_calibration_frames(dome: DomeRecord) -> CalibrationFrames | None:
     kinds = {
         key: _camera_frames(dome, fields.object(key), key)
         for key in KINDS
-        if fields.has(key)
+        if _is_recorded(fields, key)
     }
     exposures = {}
     if "exposures" in fields.data or any(EXPOSURE in KINDS[key] for key in kinds):
@@ -257,13 +257,23 @@ def read_calibration_frames(dome: DomeRecord) -> CalibrationFrames | None:
     points = (
         _known_points(dome, fields.object("points")) if fields.has("points") else {}
     )
-    ball = _ball_frames(dome, fields.object("ball")) if fields.has("ball") else None
+    ball = None
+    if _is_recorded(fields, "ball"):
+        ball = _ball_frames(dome, fields.object("ball"))
     fields.require_known(
         "its keys are exposures, dark, response, flat, chart, points and ball",
         "correct the name, or remove the key",
     )
     require_none(fields.faults)
     return CalibrationFrames(dome.folder, exposures, kinds, points, ball)
+
+
+def _is_recorded(fields: Fields, key: str) -> bool:
+    """Whether there is more of a target than its description."""
+    item = fields.get(key, None)
+    return item is not None and not (
+        isinstance(item, dict) and item.keys() <= {"pitch", "radius"}
+    )
 
 
 def _camera_frames(dome: DomeRecord, item: Fields, key: str) -> CameraFrames:

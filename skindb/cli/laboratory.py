@@ -126,6 +126,9 @@ def calibrate(
 ) -> None:
     """Calibrate the lights, cameras and probe of a laboratory.
 
+    If SETUP holds dome/boards.json, the cameras and, by a mirror ball, the lights are
+    located in the frame of the board, and SETUP/dome/dome.json is completed.
+
     Lights are calibrated from the frames of the white target in SETUP. If SETUP holds
     dome/calibration.json, the positions of the lights (by a mirror ball) and the
     cameras (response, noise, vignette, colour and lens) are calibrated first, where the
@@ -212,6 +215,12 @@ def _rig_lines(report: Json) -> list[str]:
 def _calibration_lines(report: Json) -> list[str]:
     """What a calibration found, one line each."""
     lines = _camera_lines(report.get("cameras", {}))
+    if boards := report.get("boards"):
+        lines.append(
+            "geometry of {cameras} cameras by the board, written to dome.json: focal lengths "
+            "within {focal_error_px:.1f} px, directions {turn_error_degrees:.2f} degrees, "
+            "places {position_error_mm:.1f} mm (standard errors)".format(**boards)
+        )
     if "largest_position_error_mm" in report:
         lines.append(
             "positions of the lights: standard error at most "

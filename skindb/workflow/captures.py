@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from xarray import Dataset
 
+from skindb.calibration.boards import FILE as BOARDS
 from skindb.calibration.cameras import calibrate_cameras, calibrated_cameras
 from skindb.calibration.fibres import calibrate_probe, calibrated_probe
 from skindb.calibration.lights import (
@@ -23,10 +24,12 @@ from skindb.calibration.lights import (
     rig_dome,
     rig_positions,
 )
+from skindb.calibration.setup import FILE as CALIBRATION_FILE
 from skindb.calibration.setup import (
     read_calibration_frames,
     read_flat_frames,
     read_setup_dome,
+    with_placeholders,
 )
 from skindb.errors import Fault, InputError, add_filename, input_error, require
 from skindb.files import Json, plain
@@ -58,6 +61,7 @@ from skindb.types import Progress, silent
 from skindb.workflow.administration import superseded_calibrations
 from skindb.workflow.audit import logged_action
 from skindb.workflow.derive import code_digest, groups_of
+from skindb.workflow.geometry import measured_cameras, write_geometry
 
 RIG = "rig_calibration"  # group of a calibration from takes
 # group of a calibration -> function that applies it to a dome
@@ -305,10 +309,12 @@ def calibrate(
     """Calibrate lights, cameras and probe of a set-up, and commit the result as the
     next version of that name.
 
-    If the set-up has dome/calibration.json, the positions of the lights and the cameras
-    are calibrated by the frames that it names. The intensities of the lights follow
-    from the white target, as the calibrated cameras see it. The probe is calibrated if
-    the set-up has contact/calibration.json.
+    If the set-up has dome/boards.json, the cameras are calibrated by the board, the lights by
+    the mirror ball in its frame, and both are written into dome/dome.json, which may lack
+    them; the white target stands where the board did. If it has dome/calibration.json, the
+    positions of the lights and the cameras are calibrated by the frames that it names. The
+    intensities of the lights follow from the white target, as the calibrated cameras see
+    it. The probe is calibrated if the set-up has contact/calibration.json.
 
     Parameters
     ----------
@@ -338,26 +344,44 @@ def calibrate(
     chosen = CalibrationParameters(name, **options)
     key = require_text(name, NAME.pattern, "name of a calibration")
     require_kind_of_calibration(db, key, rig=False)
-    dome = read_setup_dome(Path(setup))
+    folder = Path(setup)
+    geometry = dict[str, Any]()
+    cameras = dict[str, Any]()
+    if (folder / BOARDS).is_file():
+        geometry, cameras = measured_cameras(folder)
+        geometry = with_placeholders(geometry)
+    dome = read_setup_dome(folder, record=geometry or None)
     groups = dict[str, Dataset]()
-    if frames := read_calibration_frames(dome):
+    frames = read_calibration_frames(dome)
+    require(
+        not geometry or (frames and frames.ball),
+        str(folder / CALIBRATION_FILE),
+        "lights must be calibrated in the frame of the board, by a mirror ball",
+        "no ball",
+        f"photograph it (skindb capture --calibration ball), or remove {BOARDS}",
+    )
+    if frames:
         if frames.ball is not None:
             groups["position_calibration"] = calibrate_positions(dome, frames.ball)
             dome = positioned_dome(
                 dome, groups["position_calibration"], where="the calibrated positions"
             )
         groups["camera_calibration"] = calibrate_cameras(dome, frames)
+        if cameras:
+            rms = [cameras[name]["rms_px"] for name in dome.camera_ids]
+            groups["camera_calibration"][variables.REPROJECTION_RMS].values[:] = rms
         dome = calibrated_cameras(
             dome, groups["camera_calibration"], where="the calibrated cameras"
         )
     groups["light_calibration"] = calibrate_lights(
         dome, position_error=chosen.position_error
     )
-    if (flat := read_flat_frames(Path(setup))) is not None:
+    if (flat := read_flat_frames(folder)) is not None:
         groups["probe_calibration"] = calibrate_probe(flat)
     parameters = {
-        "setup": Path(setup).name,
+        "setup": folder.name,
         "position_error": chosen.position_error,
+        **({"boards": cameras} if cameras else {}),
     }
     provenance = {
         "command": "calibrate",
@@ -367,7 +391,10 @@ def calibrate(
     }
     with logged_action(db, "calibrate"), db.stage(CALIBRATION, key) as stage:
         stage.write(groups)
-        return stage.commit(provenance)
+        record = stage.commit(provenance)
+    if geometry:
+        write_geometry(folder, geometry, groups["position_calibration"])
+    return record
 
 
 def require_kind_of_calibration(db: Database, name: str, *, rig: bool) -> None:
@@ -453,6 +480,11 @@ def describe_calibration(db: Database, record: Record) -> Json:
         }
     if (cameras := groups.get("camera_calibration")) is not None:
         description["cameras"] = _describe_cameras(cameras)
+    if boards := record.provenance["parameters"].get("boards"):
+        names = ("focal_error_px", "turn_error_degrees", "position_error_mm")
+        description["boards"] = {"cameras": len(boards)} | {
+            key: max(one[key] for one in boards.values()) for key in names
+        }
     return description | {"ingest_again": takes_of_earlier(db, record)}
 
 

@@ -63,14 +63,20 @@ def calibrate_cameras(folder: Path, out: Path) -> Json:
         If the file exists or a picture or camera is faulty.
     """
     require(not out.exists(), str(out), "must be a new file", "one", "choose another")
+    record, report = measured_cameras(folder)
+    _dump(out, record)
+    return report
+
+
+def measured_cameras(folder: Path) -> tuple[Json, Json]:
+    """The content of a dome.json, and the errors by camera, of `calibrate_cameras`."""
     faults = list[Fault]()
     before = folder / "dome/dome.json"
     record = read_json(before, faults) if before.is_file() else {}
     require_none(faults)
     boards = read_boards(folder)
     cameras = boards_to_cameras(boards)
-    _dump(out, with_cameras(record, boards, cameras))
-    return {
+    report: Json = {
         name: {
             "rms_px": one.rms,
             "poses": one.poses,
@@ -80,6 +86,29 @@ def calibrate_cameras(folder: Path, out: Path) -> Json:
         }
         for name, one in cameras.items()
     }
+    return with_cameras(record, boards, cameras), report
+
+
+def write_geometry(folder: Path, record: Json, positions: xr.Dataset) -> None:
+    """Replace the dome.json of a set-up by one with calibrated cameras and lights, which face
+    the origin.
+    """
+    place = dict(
+        zip(
+            map(str, positions["light"].values),
+            positions[variables.CALIBRATED_POSITION].values.tolist(),
+            strict=True,
+        )
+    )
+    lights = [
+        {key: light[key] for key in light if key not in ("axis", "direction")}
+        | {"position": place[light["id"]]}
+        for light in record["lights"]
+    ]
+    file = folder / "dome/dome.json"
+    temporary = file.with_suffix(".new")
+    _dump(temporary, record | {"lights": lights})
+    temporary.replace(file)
 
 
 def register_scan(

@@ -35,6 +35,7 @@ from skindb.parameters import VIRTUAL_SEED, SessionParameters
 from skindb.schema.consent import SCOPES
 from skindb.types import Progress, silent
 from skindb.virtual.laboratory import Laboratory, laboratory_faults
+from skindb.virtual.targets import rehearsed_dome
 from skindb.workflow.simulation import simulate
 
 NECESSARY_SCOPE = "fit"
@@ -290,7 +291,7 @@ def _names(text: str) -> list[str]:
 
 
 def _setup(parameters: SessionParameters, laboratory: Laboratory | None) -> Setup:
-    folder = parameters.setup if laboratory is None else laboratory.subject
+    folder = parameters.setup or (laboratory.subject if laboratory else None)
     assert folder is not None  # a capture needs it
     return read_setup(folder)
 
@@ -435,7 +436,10 @@ def _laboratory(
         yield None
         return
     beside = out.parent / f"{out.name}.virtual"
-    subject = parameters.setup or _virtual_subject(beside, parameters.seed, progress)
+    subject = parameters.setup
+    if subject is None or not (subject / "capture.json").is_file():
+        size = _size_of(subject) if subject else VIRTUAL_SIZE
+        subject = _virtual_subject(beside, parameters.seed, size, progress)
     dome = read_capture(subject).dome
     if dome is None or not dome.frames.endswith(".png"):
         frames = "no dome" if dome is None else dome.frames
@@ -457,7 +461,22 @@ def _laboratory(
         shutil.rmtree(watched, ignore_errors=True)  # the capture has its own copies
 
 
-def _virtual_subject(folder: Path, seed: int | None, progress: Progress) -> Path:
+def _size_of(folder: Path) -> Json:
+    """Numbers of devices and size of the pictures of a set-up, as of `VIRTUAL_SIZE`."""
+    dome = read_setup(folder).dome
+    rehearsed_dome(dome)
+    first = dome.cameras[0]
+    return {
+        "cameras": len(dome.cameras),
+        "lights": len(dome.lights),
+        "width": first.width,
+        "height": first.height,
+    }
+
+
+def _virtual_subject(
+    folder: Path, seed: int | None, size: Json, progress: Progress
+) -> Path:
     """The capture of the simulated subject in a folder, simulated if it is absent."""
     seed = VIRTUAL_SEED if seed is None else seed
     subject = folder / f"subject-{seed}"
@@ -465,7 +484,7 @@ def _virtual_subject(folder: Path, seed: int | None, progress: Progress) -> Path
         # of a rehearsal that was interrupted
         shutil.rmtree(folder / "made", ignore_errors=True)
         [simulated] = simulate(
-            folder / "made", takes=1, seed=seed, progress=progress, **VIRTUAL_SIZE
+            folder / "made", takes=1, seed=seed, progress=progress, **size
         )
         simulated.rename(subject)
     return subject

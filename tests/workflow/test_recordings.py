@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from itertools import product
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+import skindb
 from skindb import workflow
 from skindb.calibration.boards import read_boards
 from skindb.calibration.setup import (
@@ -19,6 +21,7 @@ from skindb.errors import InputError
 from skindb.format.frames import read_frame, write_frame
 from skindb.hw.target_checks import Target, target_faults
 from skindb.parameters import SessionParameters
+from skindb.types import unit
 from skindb.virtual.targets import (
     BOARD,
     TargetScene,
@@ -189,3 +192,38 @@ def test_target_faults__names_what_is_wrong(
     faults = drawn(lab, tmp_path, kind, steps, seconds, edit=edit)
     assert faults
     assert all(said in str(fault) for fault in faults)
+
+
+@pytest.mark.slow  # records three targets and reads them
+def test_calibrate__completes_a_dome_without_geometry(lab, tmp_path):
+    for kind, places in (("board", 5), ("white", None), ("ball", 2)):
+        record(lab, kind, placements=places)
+    db = skindb.open(str(tmp_path / "db"))
+    before = (lab / "dome/dome.json").read_text()
+    calibration = json.loads((lab / "dome/calibration.json").read_text())
+    ball = calibration.pop("ball")
+    (lab / "dome/calibration.json").write_text(json.dumps(calibration))
+    with pytest.raises(InputError, match="by a mirror ball; found no ball"):
+        workflow.calibrate(db, lab, name="dome-a")
+    # a radius of the wrong unit
+    (lab / "dome/calibration.json").write_text(
+        json.dumps({"ball": ball | {"radius": 3.0}})
+    )
+    with pytest.raises(InputError, match="must agree with a ball of radius 3 mm"):
+        workflow.calibrate(db, lab, name="dome-a")
+    assert (lab / "dome/dome.json").read_text() == before
+    (lab / "dome/calibration.json").write_text(json.dumps({"ball": ball}))
+    version = workflow.calibrate(db, lab, name="dome-a")
+    dome = read_setup_dome(lab)
+    truth, _ = rehearsed_dome(dome)
+    corners = np.array(list(product((-60, 60), (-80, 80), (0, 60))), float)
+    for camera, true in zip(dome.cameras, truth.cameras, strict=True):
+        off = camera.project(corners) - true.project(corners)
+        assert np.sqrt(np.mean(off**2)) < 0.5  # px; corners are found to 0.2
+    for light, true in zip(dome.lights, truth.lights, strict=True):
+        cosine = unit(light.position) @ unit(true.position)
+        # highlights of a ball with a radius of 20 px are found to 0.1 px
+        assert np.degrees(np.arccos(cosine)) < 2.0
+    report = workflow.describe_calibration(db, version)
+    assert report["boards"]["cameras"] == 2
+    assert report["cameras"]["known points"]["reprojection_rms"] < 0.5
