@@ -488,7 +488,7 @@ class SessionParameters(Limited):
     setup: Path | None = option(
         None,
         "Folder with dome/dome.json and contact/probe.json of the laboratory; with "
-        "--virtual, a complete capture.",
+        "--virtual, a complete capture, or a calibrated folder of the virtual dome.",
     )
     dome: str | None = option(
         None, "Address of the light controller: /dev/ttyACM0 or socket://host:port."

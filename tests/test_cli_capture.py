@@ -677,7 +677,7 @@ def test_capture__a_capture_of_the_own_dome_can_be_rehearsed(rehearsal, tmp_path
     (tmp_path / "lab").mkdir()
     options[2] = str(tmp_path / "lab")
     result = CliRunner().invoke(cli, ["capture", str(tmp_path / "Q"), *options])
-    assert "capture.json" in str(result.exception)
+    assert "lab/dome/dome.json: the file must exist" in str(result.exception)
     assert not (tmp_path / "Q").exists()
 
 

@@ -198,7 +198,9 @@ def rehearsal_faults(parameters: SessionParameters) -> list[Fault]:
         for name in ("dome", "probe", "cameras")
         if getattr(parameters, name) is not None
     ]
-    if parameters.seed is not None and parameters.setup is not None:
+    setup = parameters.setup
+    replaced = setup is not None and (setup / "capture.json").is_file()
+    if parameters.seed is not None and replaced:
         faults.append(
             Fault(
                 "--seed",
