@@ -28,9 +28,15 @@ from skindb.files import ROOT, package_digest, plain
 from skindb.store import STUDY, SUMMARY, Database, Lease, Record
 
 PACKAGE = "skindb"
-# The store and the workflow read and commit what was computed, and the version of the
-# schema, which every version records, stands for the table of variables
-NOT_FOLLOWED = ("skindb.store.", "skindb.workflow.", "skindb.schema.variables.")
+# The store and the workflow read and commit what was computed, the list of the studies
+# names also the others, and the version of the schema, which every version records,
+# stands for the table of variables
+NOT_FOLLOWED = (
+    "skindb.store.",
+    "skindb.workflow.",
+    "skindb.analysis.studies.",
+    "skindb.schema.variables.",
+)
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 # fields of syntax trees that follow from others or do not change what is computed
 DERIVED_FIELDS = ("ctx", "kind", "type_comment", "type_params")

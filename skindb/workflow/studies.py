@@ -557,7 +557,7 @@ def _derivation(
         STUDY,
         key,
         inputs=inputs,
-        code=[record.compute, of_cohort],
+        code=[record.compute, of_cohort, open_population],
         names=names,
         parameters={"what": record.name, **requested},
         seeds={"analyze": requested["seed"]} if "seed" in requested else {},
