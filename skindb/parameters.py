@@ -266,8 +266,8 @@ class IngestParameters(Limited):
     Parameters
     ----------
     spacing_mm
-        Target distance of neighbouring surfels, which subdivision reaches within a
-        factor of sqrt 2.
+        Distance of neighbouring surfels, in the mean over the surface; points of a scan
+        that are closer to each other stay.
     photographs
         Number of merged photographs kept for comparisons.
     calibration

@@ -31,8 +31,8 @@ from skindb.types import AnyArray, Array, Index, Mask, float64
 NORMAL_95 = 1.96
 RELATIVE = "fit_relative_reflectance"  # coordinate, 1 without a white target
 MIN_SUBJECTS = 3  # for a variance between or within subjects
-# Coarsest over finest spacing of surfels of takes that are studied without a note. Scans of
-# one scanner differ by a few per cent, levels of subdivision by a factor of two.
+# Coarsest over finest spacing of surfels of takes that are studied without a note. Ingest
+# reaches the requested spacing within 2 %, unless a scan is finer.
 MAX_SPACING_RATIO = 1.3
 SPACING = (variables.REGION_AREA, variables.REGION_SURFELS)
 # ends of the names of standard errors, without what takes have in common and with it

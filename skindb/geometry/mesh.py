@@ -434,37 +434,64 @@ def subdivide(
     return matrix @ float64(vertices), current, matrix
 
 
-def carry_points(
-    face: Index, barycentric: Array, n_faces: int, levels: int
-) -> tuple[Index, Float64]:
-    """Positions of points of a mesh after `levels` levels of subdivision, at the same parameters.
+def split_longest(
+    vertices: Array, faces: Faces, count: int
+) -> tuple[Index, sp.csr_matrix]:
+    """Split the `count` longest edges in the middle, each at most once.
 
     Parameters
     ----------
-    face, barycentric
-        (k,) triangles of the old mesh and (k, 3) weights of their corners.
-    n_faces
-        Triangles of the old mesh.
-    levels
-        As in `subdivide`.
+    vertices, faces
+        (v, 3) mm and (f, 3), manifold.
+    count
+        Number of edges; all if it is larger than their number.
 
     Returns
     -------
-    face, barycentric
-        (k,) triangles of the new mesh and (k, 3) weights of their corners.
+    faces : ndarray
+        (f', 3).
+    matrix : csr_matrix
+        (v + count, v): the old vertices, then the middles of edges.
     """
-    triangle = np.array(face, np.int64)
-    weight = np.array(barycentric, np.float64).reshape(-1, 3)
-    for level in range(levels):
-        corner = weight.argmax(axis=1)
-        middle = weight.max(axis=1) < 1 / 2
-        # child i has corner i, the middle of the side from it and the middle of the
-        # side to it; child 3 the middles
-        around = np.take_along_axis(weight, (corner[:, None] + [0, 1, 2]) % 3, axis=1)
-        outer = 2 * around - [1, 0, 0]
-        weight = np.where(middle[:, None], 1 - 2 * np.roll(weight, 1, axis=1), outer)
-        triangle += np.where(middle, 3, corner) * n_faces * 4**level
-    return triangle, weight
+    corner = np.asarray(faces, np.int64)
+    table = edge_table(corner)
+    length = lengths(np.diff(float64(vertices)[table.edges], axis=1)[:, 0])
+    longest = np.argsort(-length, kind="stable")[:count]
+    middle = np.full(len(length), -1)
+    middle[longest] = len(vertices) + np.arange(len(longest))
+    rows = np.repeat(np.arange(len(longest)), 2)
+    halves = sp.csr_matrix(
+        (np.full(len(rows), 0.5), (rows, table.edges[longest].ravel())),
+        shape=(len(longest), len(vertices)),
+    )
+    matrix = sp.vstack([sp.identity(len(vertices)), halves]).tocsr()
+    return _split_faces(corner, middle[table.of_face]), matrix
+
+
+def _split_faces(corner: Index, middle: Index) -> Index:
+    """Faces (f', 3) that replace `corner` (f, 3), with vertices `middle` (f, 3) on their
+    sides, or -1.
+    """
+    count = (middle >= 0).sum(axis=1)
+    # the first side is split, and after it the others; of two, the second is not the last
+    turn = np.argmax(middle >= 0, axis=1)
+    turn[(count == 2) & (middle[:, 1] < 0)] = 2
+    around = (turn[:, None] + [0, 1, 2]) % 3
+    a, b, c = np.take_along_axis(corner, around, axis=1).T
+    ab, bc, ca = np.take_along_axis(middle, around, axis=1).T
+    # children by the number of split sides
+    children = (
+        [(a, b, c)],
+        [(a, ab, c), (ab, b, c)],
+        [(ab, b, bc), (a, ab, c), (ab, bc, c)],
+        [(a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca)],
+    )
+    parts = [
+        np.stack(child, axis=1)[count == number]
+        for number, triangles in enumerate(children)
+        for child in triangles
+    ]
+    return np.concatenate(parts)
 
 
 def _odd_rows(table: EdgeTable, opposite: Faces, n: int) -> sp.csr_matrix:

@@ -22,10 +22,11 @@ from skindb.geometry._ray_kernels import matches_tangent_plane
 from skindb.geometry.atlas import disc_atlas
 from skindb.geometry.clean import CleanMesh
 from skindb.geometry.mesh import (
-    carry_points,
     closest_on_mesh,
+    edge_table,
     lattice_spacing,
     morton_order,
+    split_longest,
     subdivide,
     vertex_areas,
     vertex_normals,
@@ -80,15 +81,20 @@ class SurfelSet:
 def build_surfels(
     capture: Capture, *, spacing_mm: float, planar: bool = False
 ) -> SurfelSet:
-    """Surfels about `spacing_mm` apart, within a factor of sqrt 2, as each level of
-    subdivision halves the spacing.
+    """Surfels `spacing_mm` apart, in the mean over the surface.
+
+    As each level of subdivision halves the spacing, the longest edges of the scan are
+    split before, as many as are needed. A scan that is finer than the spacing is not
+    thinned.
 
     `planar` surfels are the vertices of the mesh, and their texture coordinates those of
     the picture.
     """
     mesh = capture.surface
-    levels = 0 if planar else subdivision_levels(mesh, spacing_mm)
-    vertices, faces, matrix = subdivide(mesh.vertices, mesh.faces, levels)
+    levels, splits = (0, 0) if planar else subdivision(mesh, spacing_mm)
+    split, halves = split_longest(mesh.vertices, mesh.faces, splits)
+    vertices, faces, matrix = subdivide(halves @ mesh.vertices, split, levels)
+    matrix = matrix @ halves
     if planar:
         uv = _planar_uv(vertices)
     else:
@@ -116,9 +122,9 @@ def _planar_uv(vertices: Float64) -> Float32:
     return np.stack([u, 1 - v], axis=1).astype(np.float32)
 
 
-def subdivision_levels(mesh: CleanMesh, spacing_mm: float) -> int:
-    """Number of levels after which the spacing, of an even triangular lattice, is
-    closest to the target.
+def subdivision(mesh: CleanMesh, spacing_mm: float) -> tuple[int, int]:
+    """Number of levels of subdivision, and of edges to split before them, after which
+    the spacing is that of an even triangular lattice.
 
     Raises
     ------
@@ -129,8 +135,6 @@ def subdivision_levels(mesh: CleanMesh, spacing_mm: float) -> int:
         raise ValueError(f"spacing_mm must be positive, not {spacing_mm}")
     count = len(mesh.vertices)
     area = float(vertex_areas(mesh.vertices, mesh.faces).sum())
-    spacing = float(lattice_spacing(area / count))
-    levels = max(int(np.rint(np.log2(spacing / spacing_mm))), 0)
     rule = f"a capture must have at most {MAX_SURFELS:,} surfels"
     require(
         count <= MAX_SURFELS,
@@ -139,22 +143,29 @@ def subdivision_levels(mesh: CleanMesh, spacing_mm: float) -> int:
         f"{count:,} vertices of the scan, each of which becomes a surfel",
         "decimate the scan, or crop it",
     )
-    finest = int(np.log2(MAX_SURFELS / count) / 2)
+    surfels = area * float(lattice_spacing(1.0) / spacing_mm) ** 2
+    finest = 1.05 * float(lattice_spacing(area / MAX_SURFELS))  # allows for rounding
     require(
-        levels <= finest,
+        surfels <= MAX_SURFELS,
         "spacing",
         rule,
-        f"{spacing_mm:g} mm, which requires {count * 4.0**levels:,.0f}",
-        f"choose {spacing / 2**finest:.2g} mm or more",
+        f"{spacing_mm:g} mm, which requires {surfels:,.0f}",
+        f"choose {finest:.2g} mm or more",
     )
-    return levels
+    edges = len(edge_table(mesh.faces).edges)
+    faces = len(mesh.faces)
+    levels = 0
+    while count + edges <= surfels:
+        count, edges, faces = count + edges, 2 * edges + 3 * faces, 4 * faces
+        levels += 1
+    return levels, max(round((surfels - count) / 4**levels), 0)
 
 
 def transferred_landmarks(
     capture: Capture, surfels: SurfelSet
 ) -> tuple[Float64, Float64]:
-    """Landmarks (k, 3) on the surface of the surfels, transferred by subdivision, and
-    their distance (k,) in mm.
+    """The points (k, 3) of the surface of the surfels that are nearest to the
+    landmarks, and the distance (k,) of these in mm.
 
     The distance is that of the given landmark from the cleaned scan. The position is
     NaN if the landmark was cropped away, so that the complete scan is nearer to it than
@@ -163,7 +174,7 @@ def transferred_landmarks(
     landmarks = np.array([*capture.landmarks.values()]).reshape(-1, 3)
     base = capture.surface
     scan = capture.scan
-    face, weight, distance = closest_on_mesh(base.vertices, base.faces, landmarks)
+    _, _, distance = closest_on_mesh(base.vertices, base.faces, landmarks)
     near = distance <= LANDMARK_REACH
     if capture.crop is not None:
         near &= (
@@ -171,8 +182,7 @@ def transferred_landmarks(
             <= closest_on_mesh(scan.vertices, scan.faces, landmarks)[2]
             + CROPPED_LANDMARK_MM
         )
-    levels = round(np.log2(len(surfels.faces) / len(base.faces)) / 2)
-    face, weight = carry_points(face, weight, len(base.faces), levels)
+    face, weight, _ = closest_on_mesh(surfels.position, surfels.faces, landmarks)
     position = np.einsum("kc,kci->ki", weight, surfels.position[surfels.faces[face]])
     return np.where(near[:, None], position, np.nan), distance
 

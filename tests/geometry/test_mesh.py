@@ -16,13 +16,13 @@ from skindb.geometry._mesh_kernels import grown, mixed
 from skindb.geometry.mesh import (
     MORTON_BITS,
     boundary_loops,
-    carry_points,
     closest_on_mesh,
     edge_table,
     face_components,
     fans,
     loop_matrix,
     morton_order,
+    split_longest,
     subdivide,
     vertex_areas,
     vertex_normals,
@@ -462,35 +462,30 @@ def test_loop_matrix__agrees_with_libigl_in_the_interior(mesh):
     assert len(their_faces) == 4 * len(f)
 
 
-def test_carry_points__stay_at_their_parameter():
-    """Without smoothing (new vertices in the middle of their edges) a carried point
-    does not move.
+def test_split_longest__tiles_the_surface_and_keeps_its_winding():
+    """Every number of split edges, so that all kinds of triangles occur; middles do not
+    change the surface.
     """
-    v, f = open_sphere()
-    rng = np.random.default_rng(2)
-    face = rng.integers(0, len(f), 200)
-    weight = rng.dirichlet([1, 1, 1], 200)
-    weight[:4] = [[1, 0, 0], [0, 0.5, 0.5], [0.5, 0.25, 0.25], [1 / 3, 1 / 3, 1 / 3]]
-    there = np.einsum("kc,kci->ki", weight, v[f[face]])
-    flat = v
-    faces = f
-    for levels in range(4):
-        at, share = carry_points(face, weight, len(f), levels)
-        np.testing.assert_allclose(
-            np.einsum("kc,kci->ki", share, flat[faces[at]]), there, atol=1e-10
-        )
-        np.testing.assert_allclose(share.sum(axis=1), 1)
-        assert share.min() >= -1e-12
-        matrix, children = loop_matrix(faces, len(flat))
-        middle = np.zeros((matrix.shape[0] - len(flat), 3))
-        # the middle child's corners: one on each side of its parent
-        corner = children[3 * len(faces) :] - len(flat)
-        for side in range(3):
-            middle[corner[:, side]] = (
-                flat[faces[:, side]] + flat[faces[:, (side + 1) % 3]]
-            ) / 2
-        flat = np.concatenate([flat, middle])
-        faces = children
+    v, f = grid()
+    edges = len(edge_table(f).edges)
+    rng = np.random.default_rng(0)
+    # edges of different lengths
+    bent = v + rng.uniform(-0.1, 0.1, v.shape) * (1, 1, 0)
+    area = vertex_areas(bent, f).sum()
+    for count in range(edges + 1):
+        faces, matrix = split_longest(bent, f, count)
+        points = matrix @ bent
+        assert len(points) == len(v) + count
+        assert vertex_areas(points, faces).sum() == pytest.approx(area)
+        table = edge_table(faces)
+        assert table.count.max() == 2
+        assert not winding_flips(faces).any()
+        assert len(points) - len(table.edges) + len(faces) == 1
+    sides = np.linalg.norm(np.diff(bent[edge_table(f).edges], axis=1)[:, 0], axis=1)
+    _, one = split_longest(bent, f, 1)
+    np.testing.assert_array_equal(
+        np.flatnonzero(one[-1].toarray()), edge_table(f).edges[sides.argmax()]
+    )
 
 
 def test_loop_matrix__children_tile_the_parent_and_keep_its_winding():

@@ -127,7 +127,8 @@ def write_merged(folder, dome):
 # photograph
 LIMITS = {
     write_chain: (0.002, 0.008, 0.04, 2e-3, 0.05),
-    write_merged: (0.001, 0.002, 0.012, 1e-5, 6e-4),
+    # 1.4 %: middles of edges lie below the sphere
+    write_merged: (0.001, 0.002, 0.014, 1e-5, 6e-4),
 }
 
 
@@ -158,7 +159,7 @@ def test_ingest_capture__sees_the_sphere_through_all_that_a_camera_does(
     ):
         known = np.isfinite(samples).all(-1) & (truth > 0.3 * ALBEDO / np.pi).all(-1)
         error = samples[known] / truth[known] - 1
-        assert len(error) > 5000
+        assert len(error) > 4000
         assert (np.abs(np.median(error, axis=0)) < bias).all()
         assert np.median(np.abs(error)) < size
         assert np.quantile(np.abs(error), 0.99) < most

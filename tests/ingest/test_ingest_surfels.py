@@ -10,6 +10,7 @@ from sphere import RADIUS, look_at
 
 from skindb.errors import InputError
 from skindb.geometry.camera import camera_centre, pixel_rays, project
+from skindb.geometry.clean import clean_mesh
 from skindb.geometry.mesh import morton_order, subdivide, vertex_normals
 from skindb.geometry.rays import RayScene
 from skindb.ingest.surfels import (
@@ -17,13 +18,15 @@ from skindb.ingest.surfels import (
     BLENDED,
     SurfelSet,
     blended_lobes,
+    build_surfels,
     camera_visibility,
     disc_points,
     light_visibility,
-    subdivision_levels,
+    subdivision,
 )
 from skindb.virtual.face import FaceShape
 from skindb.virtual.head import parametric_head
+from skindb.virtual.person import cohort_people, face_shape
 
 
 def plate_with_wall(spacing=1.0):
@@ -348,42 +351,50 @@ def test_visibility__one_triangle(capture):
     assert share[:, 0].tolist() == [1, 1, 0]
 
 
-@pytest.mark.parametrize(
-    ("spacing", "levels"), [(20.0, 0), (5.0, 0), (2.5, 1), (1.25, 2)]
-)
-def test_subdivision_levels__nearest_to_the_spacing_wanted(capture, spacing, levels):
-    assert subdivision_levels(capture.surface, spacing) == levels
+def test_build_surfels__are_as_far_apart_as_requested_on_every_face(capture):
+    """Three shapes, whose scans have points 7 to 8 mm apart."""
+    shapes = [face_shape(person) for person in cohort_people(3)]
+    for shape, spacing in product(shapes, (3.0, 5.0)):
+        head = parametric_head(shape, spacing_mm=8.0)
+        scan = clean_mesh(head.vertices, head.faces)
+        surfels = build_surfels(
+            replace(capture, surface=scan, scan=scan, regions={}), spacing_mm=spacing
+        )
+        # 1.5 %, as smoothing makes the surface smaller
+        assert surfels.spacing() == pytest.approx(spacing, rel=0.015)
 
 
-def test_subdivision_levels__says_what_is_too_fine(capture):
+def test_build_surfels__a_finer_scan_stays(capture):
+    surfels = build_surfels(capture, spacing_mm=20.0)
+    assert len(surfels.position) == len(capture.surface.vertices)
+
+
+def test_subdivision__says_what_is_too_fine(capture):
     with pytest.raises(
         InputError,
-        match=r"at most 2,500,000 surfels; found 0\.05 mm.*choose (0\.\d+) mm",
+        match=r"at most 2,500,000 surfels; found 0\.01 mm.*choose (0\.\d+) mm",
     ) as caught:
-        subdivision_levels(capture.surface, 0.05)
+        subdivision(capture.surface, 0.01)
     finest = float(str(caught.value).split("choose ")[1].split(" mm")[0])
-    levels = subdivision_levels(capture.surface, finest)
-    assert (
-        len(capture.surface.vertices) * 4**levels
-        <= 2_500_000
-        < len(capture.surface.vertices) * 4 ** (levels + 1)
-    )
+    subdivision(capture.surface, finest)
+    with pytest.raises(InputError, match="at most 2,500,000 surfels"):
+        subdivision(capture.surface, 0.9 * finest)
 
 
-def test_subdivision_levels__the_scan_alone_may_be_too_fine(capture, monkeypatch):
+def test_subdivision__the_scan_alone_may_be_too_fine(capture, monkeypatch):
     count = len(capture.surface.vertices)
     monkeypatch.setattr("skindb.ingest.surfels.MAX_SURFELS", count)
-    assert subdivision_levels(capture.surface, 20.0) == 0
+    assert subdivision(capture.surface, 20.0) == (0, 0)
     monkeypatch.setattr("skindb.ingest.surfels.MAX_SURFELS", count - 1)
     with pytest.raises(
         InputError, match=rf"found {count:,} vertices of the scan.*decimate the scan"
     ):
-        subdivision_levels(capture.surface, 20.0)
+        subdivision(capture.surface, 20.0)
 
 
-def test_subdivision_levels__refuses_zero(capture):
+def test_subdivision__refuses_zero(capture):
     with pytest.raises(ValueError, match="must be positive"):
-        subdivision_levels(capture.surface, 0.0)
+        subdivision(capture.surface, 0.0)
 
 
 def test_blended_lobes__change_evenly_over_the_borders_of_regions():
