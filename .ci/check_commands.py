@@ -23,6 +23,7 @@ from check_docs import ROOT, commands, pages
 from click.testing import CliRunner
 
 from skindb.cli import cli
+from skindb.virtual.targets import write_laboratory
 
 # or add a study or a release
 READ_ONLY = {"info", "verify", "show", "compare", "analyze", "release", "dictionary"}
@@ -38,6 +39,14 @@ TOO_FEW = (
     "some region must determine it",
     "must differ between takes",
 )
+
+# the rehearsal of a laboratory, in less than a minute
+SMALL = {"cameras": 3, "lights": 10, "width": 160, "height": 200}
+FEWER = {
+    "board": ["--placements", "5"],
+    "ball": ["--placements", "2"],
+    "ingest": ["--spacing", "4"],
+}
 
 
 def is_run(words: list[str]) -> bool:
@@ -84,13 +93,27 @@ def failure(call: list[str]) -> str:
     return done.stdout + done.stderr if done.returncode else ""
 
 
+def rehearsal() -> list[list[str]]:
+    """Commands and Python block of the page that rehearses a laboratory, in their order, with
+    fewer poses and places.
+    """
+    page = (ROOT / "docs/howto/laboratory.md").read_text(encoding="utf-8")
+    called = [
+        words + [option for word in words for option in FEWER.get(word, [])]
+        for _, words in commands(page)
+    ]
+    block = re.findall(r"^```python\n(.*?)^```", page, re.S | re.M)
+    return [*called, [sys.executable, "-c", *block]]
+
+
 def main() -> int:
     """Run the commands, and stop at the first one that fails."""
     os.environ["MPLBACKEND"] = "agg"
     with tempfile.TemporaryDirectory() as folder, chdir(folder):
         copytree(ROOT / "demo/db", "demo/db")
         Path("faces").symlink_to("demo/db")
-        found = calls()
+        write_laboratory(Path("LAB"), **SMALL)
+        found = calls() + rehearsal()
         for call in found:
             messages = failure(call)
             if messages and not any(rule in messages for rule in TOO_FEW):

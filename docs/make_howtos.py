@@ -50,6 +50,7 @@ def main() -> None:
             "--width=240", "--height=300")  # fmt: skip
         photographs(folder / "captures/V001", folder)
         landmarks(folder / "captures/V001/scan.ply")
+        targets(folder / "LAB")
     diagrams()
     for path in PICTURES.glob("*.png"):
         if path.stat().st_size > MAX_BYTES:
@@ -156,6 +157,22 @@ def photographs(capture: Path, folder: Path) -> None:
     side_by_side(
         "pictures", [bright[0], *(np.array(Image.open(m).convert("RGB")) for m in maps)]
     )
+
+
+def targets(lab: Path) -> None:
+    """One camera's frames of calibration targets, whose few colours are kept."""
+    for kind in ("board", "white", "ball", "chart"):
+        run("capture", lab, "--calibration", kind, "--virtual")
+    camera = json.loads((lab / "dome/dome.json").read_text())["cameras"][1]
+    names = ("calibration/board_1_c01", "calibration/board_2_c01", "white/e0/l003_c01",
+             "calibration/ball_1_l005_c01", "calibration/chart_c01_f0")  # fmt: skip
+    files = [lab / f"dome/{name}.png" for name in names]
+    frames = [imagecodecs.png_decode(file.read_bytes()) for file in files]
+    joined = Image.fromarray(
+        np.concatenate([displayed(frame, camera) for frame in frames], axis=1)
+    )
+    few = joined.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    few.save(PICTURES / "howto_laboratory.png", optimize=True)
 
 
 def displayed(frame: NDArray[np.uint16], camera: dict[str, float]) -> NDArray[np.uint8]:

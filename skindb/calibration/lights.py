@@ -72,6 +72,10 @@ BEHIND = (
     0.8,
     1.0,
 )  # radii: highlights on the front to those of its edge
+OUTLIERS = (
+    0.3,
+    0.01,
+)  # rad, misses from which a ray counts less: at first, and at the end
 # median of the highlights: a pixel on a ball with a radius of 100 px turns a ray by 1.1 degrees
 MAX_MISS_DEGREES = 2.0
 # half diagonals of the target: light farther from its centre is not that of its blurred
@@ -312,7 +316,9 @@ def ball_places(
     back = np.array([unit(centre - eyes).mean(axis=0) for centre in front])
     starts = [(front + part * radius * back).ravel() for part in BEHIND]
     best = min(starts, key=lambda x: float(np.abs(misses(x)).sum()))
-    fit = least_squares(misses, best, loss="soft_l1", f_scale=0.01)
+    for outlier in OUTLIERS:
+        fit = least_squares(misses, best, loss="soft_l1", f_scale=outlier)
+        best = fit.x
     miss = np.degrees(np.median(lengths(fit.fun.reshape(-1, 3))))
     # balls of a wrong size fit best far away, where all lines are parallel
     away = lengths(fit.x.reshape(-1, 3) - front).max()

@@ -27,7 +27,7 @@ from skindb.hw.frame_markers import marker_light
 from skindb.hw.sequence import DARK, GAP_SECONDS, Schedule, Step, slowed_schedule
 from skindb.hw.session import capture_dome, require_complete
 from skindb.hw.target_checks import Taken, Target, target_faults
-from skindb.parameters import SessionParameters
+from skindb.parameters import VIRTUAL_SEED, SessionParameters
 from skindb.types import Progress, silent
 from skindb.virtual.laboratory import Laboratory, laboratory_faults
 from skindb.virtual.targets import TargetScene, rehearsed_dome, write_laboratory
@@ -222,7 +222,7 @@ def _virtual_targets(
     dome = laboratory.dome
     faults = laboratory_faults(parameters.faults, dome.light_ids, dome.camera_ids)
     virtual, sensor = rehearsed_dome(dome)
-    rng = np.random.default_rng()
+    rng = np.random.default_rng(VIRTUAL_SEED)
     scene = TargetScene(virtual, sensor, kind, seconds, rng=rng)
     watched = laboratory.folder.parent / f"{laboratory.folder.name}.virtual/frames"
     clock = SimulatedClock(time.time())
