@@ -5,6 +5,7 @@ import subprocess
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 from skindb.errors import Fault, SkindbWarning, require_none
@@ -57,7 +58,8 @@ class StreamingCameras(FolderCameras):
             fields.fault(
                 "cameras", "are streamed by Aravis", f"no {PYTHON}", aravis.PACKAGES
             )
-        require_none(faults)
+        pages = ("docs/capture_format.md", "docs/howto/capture.md")
+        require_none([replace(f, cure=f.cure.replace(*pages)) for f in faults])
         for name in ids:
             make_private(root / name)
         super().__init__(root, ids)

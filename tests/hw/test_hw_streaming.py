@@ -139,7 +139,7 @@ def test_streaming_cameras__a_run_without_triggers_keeps_every_frame(camera, tmp
         ("Gian=3", ADDRESS, r"camera c0: must stream; found \[Gian\] Not found; cor"),
         ("PixelFormat=RGB8", ADDRESS, "PixelFormat RGB8 is not Mono or Bayer"),
         (SIZE, "127.0.0.77", "camera c0: must stream; found .*127.0.0.77"),
-        ("", "", "must be text, and not empty"),
+        ("", "", "must be text, and not empty; .*see docs/howto/capture.md"),
     ],
 )
 def test_streaming_cameras__a_wrong_setting_is_one_line(
