@@ -8,7 +8,7 @@ At least 60 surfels are needed. A planted component can only be found if removin
 increases the error. The least important component is therefore redrawn until removing
 any of them increases the error by 20 %, at most a hundred times; problems that stay
 below 5 % are counted separately. The number in brackets is the error with the planted
-basis over that with all BRDFs. The threshold of the rule was chosen on seeds 0 to 2.
+basis over that with all BRDFs.
 """
 
 from __future__ import annotations

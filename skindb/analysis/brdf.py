@@ -28,7 +28,6 @@ from skindb.numerics.factorise import Sums, nmf, refine
 from skindb.numerics.nnls import solve_nnls
 from skindb.numerics.statistics import bootstrap_interval
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.reflectance.kinds import even_diffuse
 from skindb.reflectance.mixture import basis_rows
 from skindb.reflectance.reduction import Systems, factor_reflectance, residuals
 from skindb.reflectance.tables import TableGrid, brdf_metric
@@ -36,7 +35,7 @@ from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
 from skindb.study_parameters import DECLARED, BrdfParameters
 from skindb.threads import c_contiguous
-from skindb.types import Array, Float32, Index, dots, finite_rows, unit
+from skindb.types import Array, Index, dots, finite_rows, unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,12 +51,16 @@ BASIS_SIZE_VARIABLES = (
     variables.LIGHT_POSITION,
     variables.CAMERA_POSITION,
 )
-NEEDED = (*BASIS_SIZE_VARIABLES, "fit_eta", "fit_even_reflection")
+NEEDED = (*BASIS_SIZE_VARIABLES, "fit_eta")
 DEFAULT_ETA = 1.3  # refractive index of models without parameters of the fit
 BLOCK = 128  # surfels at a time: rows of 2,400 samples and 59 bases take 72 MB
-# see `choose_size`; tuned on planted problems, where 0.2 % and 0.4 % distinguish fewer
-# sizes
-STEP = 0.003
+# see `choose_size`; chosen on virtual subjects: errors of geometry act like further bases of
+# up to 0.4 % each, 1.4 % in all
+STEP = 0.01
+TOLERANCE = 0.02
+# noise of samples that is assumed: sensor [sr^-1], and geometry, relative
+NOISE_FLOOR = 0.001
+RELATIVE_NOISE = 0.02
 TABLE_HEADER = (
     "k",
     "error above that with all bases [%]",
@@ -235,14 +238,16 @@ def basis_size_curve(
     *,
     tables: Array | Delayed,
     ks: Sequence[int] = range(1, 13),
-    tolerance: float = 0.01,
+    tolerance: float = TOLERANCE,
     rng: Generator,
 ) -> Dataset:
     """Reconstruction error of reflectance as a function of the number of basis BRDFs.
 
     Bases of every size are computed from the reflectance of up to 2,000 of the sampled
-    surfels; then the samples of each surfel (minus the diffuse term) are fitted with
-    the k mixtures by linear NNLS, take by take. Factorising the stored weights instead,
+    surfels; then the samples of each surfel are fitted with the k mixtures by linear
+    NNLS, take by take. Each surfel has its own diffuse term and even reflection: errors
+    at grazing angles look like one more even basis. Surfels that even the dictionary fits
+    badly count less (`Systems.of_equal_noise`). Factorising the stored weights instead,
     as in the paper, gave 1.02 to 3.7 times the error on planted problems at the planted
     size, because the weights are not unique.
 
@@ -433,21 +438,19 @@ def _systems(take: Dataset, tables: Array, part: slice) -> Systems:
     eta = float(take["fit_eta"]) if "fit_eta" in take else np.nan
     # for models that do not state the parameters of their fit
     eta = eta if np.isfinite(eta) else DEFAULT_ETA
-    if "fit_even_reflection" in take:
-        even = float(np.nan_to_num(float(take["fit_even_reflection"])))
-        surfels = surfels.assign({variables.EVEN_REFLECTION: even})
     parts = []
     for start in range(0, max(surfels.sizes["surfel"], 1), BLOCK):
         block = surfels.isel(surfel=slice(start, start + BLOCK))
         parts.append(Systems.of(*_surface_rows(block, tables, eta)))
-    return Systems.joined(parts)
+    return Systems.joined(parts).of_equal_noise()
 
 
 def _surface_rows(
     surfels: Dataset, tables: Array, eta: float
-) -> tuple[Float32, Index, Array]:
-    """Basis rows with their offsets, and the samples (total, 3) minus the diffuse term,
-    for a few surfels.
+) -> tuple[Array, Index, Array, Array]:
+    """Basis rows with their offsets, the samples (total, 3), and the columns (total, 2)
+    of light from within the skin and of even reflection, divided by the noise, for a few
+    surfels.
     """
     position = surfels[variables.SURFEL_POSITION].values[:, None].astype(float)
     normal = surfels[variables.SHADING_NORMAL].values.astype(float)
@@ -464,14 +467,11 @@ def _surface_rows(
     surfel = np.repeat(np.arange(len(position)), np.diff(offsets))
     cos_i = dots(normal[surfel], to_light[surfel, index[:, 0]])
     cos_o = dots(normal[surfel], to_camera[surfel, index[:, 1]])
-    passed = (
-        cos_i
-        * fresnel_transmittance(cos_i, eta)
-        * fresnel_transmittance(cos_o, eta)
-        / np.pi
-    )
-    diffuse = even_diffuse(surfels).astype(float)[surfel] * passed[:, None]
-    return rows, offsets, values[surfel, index[:, 0], index[:, 1]] - diffuse
+    passed = fresnel_transmittance(cos_i, eta) * fresnel_transmittance(cos_o, eta)
+    samples = values[surfel, index[:, 0], index[:, 1]]
+    noise = np.hypot(NOISE_FLOOR, RELATIVE_NOISE * samples.mean(axis=1))[:, None]
+    even = np.stack([passed * cos_i, cos_i], axis=1)
+    return rows / noise, offsets, samples / noise, even / noise
 
 
 def plot_basis_size(curves: Mapping[str, Dataset], *, ax: Axes | None = None) -> Axes:

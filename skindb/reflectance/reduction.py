@@ -319,21 +319,48 @@ class Systems(NamedTuple):
     samples: Array  # (n,) number of values in r
 
     @classmethod
-    def of(cls, rows: Array, offsets: Index, target: Array) -> Systems:
+    def of(
+        cls, rows: Array, offsets: Index, target: Array, besides: Array | None = None
+    ) -> Systems:
         """Normal equations of rows (total, m) and samples (total, channels); `offsets`
         (n + 1,) start each surfel.
+
+        Columns `besides` (total, c) have the best weights for each surfel and channel,
+        whatever the other weights are.
         """
         n = len(offsets) - 1
         m = rows.shape[1]
         gram = np.zeros((n, m, m))
         rhs = np.zeros((n, m))
+        square = np.zeros(n)
+        columns = np.zeros((len(rows), 0)) if besides is None else besides
         for s, (start, stop) in enumerate(pairwise(offsets)):
+            space = np.linalg.qr(columns[start:stop])[0]
             block = float64(rows[start:stop])
+            block -= space @ (space.T @ block)
+            values = target[start:stop]
             gram[s] = target.shape[1] * (block.T @ block)
-            rhs[s] = block.T @ target[start:stop].sum(axis=1)
-        surfel = np.repeat(np.arange(n), np.diff(offsets))
-        square = float64(np.bincount(surfel, (target**2).sum(axis=1), n))
-        return cls(gram, rhs, square, float64(np.diff(offsets)) * target.shape[1])
+            rhs[s] = block.T @ values.sum(axis=1)
+            square[s] = (values**2).sum() - ((space.T @ values) ** 2).sum()
+        samples = np.maximum(np.diff(offsets) - columns.shape[1], 0) * target.shape[1]
+        return cls(gram, rhs, square, float64(samples))
+
+    def of_equal_noise(self) -> Systems:
+        """The systems with weights by which no surfel has a residual above the median.
+
+        Otherwise the one per cent of the surfels that no BRDF explains (folds, edges of
+        shadows) would decide about half of the error.
+        """
+        x, squares = residuals(self)
+        free = np.maximum(self.samples - (x > 0).sum(axis=1), 1)
+        variance = squares / free
+        weight = 1 / np.maximum(variance + np.median(variance), np.finfo(float).tiny)
+        return Systems(
+            weight[:, None, None] * self.gram,
+            weight[:, None] * self.rhs,
+            weight * self.square,
+            self.samples,
+        )
 
     def within(self, H: Array) -> Systems:
         """Normal equations for the weights of k mixtures H (k, m)."""

@@ -184,19 +184,38 @@ def _capture(model: xr.DataTree, noise: float) -> xr.DataTree:
 @pytest.mark.slow
 def test_basis_size_curve__finds_the_planted_size():
     models = {t: m for t, m in _population().items() if t in ("A", "B")}
-    # noise of 0.4 and 0.5 % gives the same sizes; with 0.3 % the last bits of the
-    # factorisation decide the larger one
-    captures = {t: _capture(m, 0.0045) for t, m in models.items()}
+    # the third basis lowers the error by 3 %
+    captures = {t: _capture(m, 0.001) for t, m in models.items()}
     cohort = cohort_of(models, "surfels", captures=captures, surfels=40)
     curve = basis_size_curve(
         cohort, tables=TABLES, ks=(1, 2, 3, 4, 5, 6), rng=np.random.default_rng(0)
     )
-    # 80 surfels: four or five may be a little better
-    assert curve["smallest_size"] == 3 < curve["sufficient_size"] < 6
+    assert curve["smallest_size"] == curve["sufficient_size"] == 3
     assert float(curve["relative_error"].sel(k=1)) > 1.1
     assert (curve["relative_error_low"] <= curve["relative_error"] + 1e-9).all()
     assert curve.attrs["surfels"] == 80
     assert plot_basis_size({"planted": curve}).get_xlabel()
+
+
+def test_basis_size_curve__even_reflection_and_outliers_are_no_bases():
+    """Every surfel reflects some light evenly, and no BRDF explains three of them."""
+    models = {t: m for t, m in _population().items() if t in ("A", "B")}
+    captures = {t: _capture(m, 0.001) for t, m in models.items()}
+    rng = np.random.default_rng(0)
+    for take, capture in captures.items():
+        fitted = models[take]["fitted"]
+        place = fitted["surfel_position"].values[:, None].astype(float)
+        to_light = _unit(capture["dome"]["light_position"].values - place)
+        cosine = np.einsum("nli,ni->nl", to_light, fitted["shading_normal"].values)
+        sample = capture["samples"]["reflectance_sample"]
+        even = rng.uniform(0, 0.05, len(place))[:, None] * cosine
+        sample.values += even[..., None, None]
+        sample.values[7:10] *= rng.lognormal(0, 0.1, sample.values[7:10].shape)
+    cohort = cohort_of(models, "surfels", captures=captures, surfels=60)
+    curve = basis_size_curve(
+        cohort, tables=TABLES, ks=(1, 2, 3, 4, 5, 6), rng=np.random.default_rng(0)
+    )
+    assert curve["smallest_size"] == curve["sufficient_size"] == 3
 
 
 def _benchmark():
@@ -212,7 +231,7 @@ def test_basis_size_curve__streams_what_it_does_not_factor(monkeypatch):
     its plateau at the same place.
     """
     models = {t: m for t, m in _population().items() if t in ("A", "B")}
-    captures = {t: _capture(m, 0.003) for t, m in models.items()}
+    captures = {t: _capture(m, 0.001) for t, m in models.items()}
     cohort = cohort_of(models, "surfels", captures=captures, surfels=40)
     call = {"tables": TABLES, "ks": (1, 2, 3, 4, 5, 99)}
     whole = basis_size_curve(cohort, rng=np.random.default_rng(0), **call)
@@ -263,12 +282,12 @@ def test_choose_size__by_hand():
         )[3]
 
     assert size(3.0, 1.5, 1.009, 1.008, 1.0) == (3, 3)
-    assert size(3.0, 1.5, 1.012, 1.008, 1.0) == (4, 0)  # only the largest
+    assert size(3.0, 1.5, 1.03, 1.008, 1.0) == (4, 0)  # only the largest
     assert size(3.0, 1.5, 1.010, 1.008, 1.008, 1.0) == (3, 3)
-    # within 1 %, but a step of 0.4 % remains
-    assert size(3.0, 1.5, 1.012, 1.008, 1.008, 1.0) == (4, 4)
+    # within 2 %, but a step of 1.2 % remains
+    assert size(3.0, 1.5, 1.02, 1.008, 1.008, 1.0, tolerance=0.02) == (4, 4)
     # the step comes later
-    assert size(3.0, 1.5, 1.008, 1.008, 1.0045, 1.0045, 1.0) == (5, 5)
+    assert size(3.0, 1.5, 1.02, 1.02, 1.005, 1.005, 1.0, tolerance=0.02) == (5, 5)
     # small steps that add up to 1 %
     assert size(1.013, 1.0108, 1.0086, 1.0064, 1.0042, 1.002, 1.0) == (2, 2)
     assert size(1.013, 1.0108, 1.0086, 1.0064, 1.0042, 1.002, 1.0, tolerance=0.02) == (
@@ -286,7 +305,7 @@ def test_choose_size__is_a_range_if_the_sample_is_ambiguous():
     """
     errors = np.ones((50, 3, 5))
     errors[:, 0, 0] = 4.0
-    errors[0, 0, 1] += 0.25
+    errors[0, 0, 1] += 0.9
     error, low, _, sizes = choose_size(
         errors, (1, 2, 3, 4), tolerance=0.01, rng=np.random.default_rng(0)
     )
@@ -338,7 +357,7 @@ def test_tabulate_basis_size__one_size():
             3,
             "2 to 3 bases. With 3 the error is significantly within 1 % of that "
             "with 4, the largest size tried, and no "
-            "further basis reduces it by more than 0.3 %; this sample does not "
+            "further basis reduces it by more than 1 %; this sample does not "
             "show whether fewer would suffice.",
         ),
         (
@@ -353,7 +372,7 @@ def test_tabulate_basis_size__one_size():
             2,
             "2 bases. With 2 .*; smaller sizes are significantly worse.",
         ),
-        ([1.0, 1.0, 1.0], 1, 1, "1 basis. With 1 .* by more than 0.3 %."),
+        ([1.0, 1.0, 1.0], 1, 1, "1 basis. With 1 .* by more than 1 %."),
         (
             [1.9, 1.5, 1.3],
             3,
