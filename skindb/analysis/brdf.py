@@ -55,7 +55,7 @@ NEEDED = (*BASIS_SIZE_VARIABLES, "fit_eta")
 DEFAULT_ETA = 1.3  # refractive index of models without parameters of the fit
 BLOCK = 128  # surfels at a time: rows of 2,400 samples and 59 bases take 72 MB
 # see `choose_size`; chosen on virtual subjects: errors of geometry act like further bases of
-# up to 0.4 % each, 1.4 % in all
+# up to 0.6 % each, 1.8 % in all
 STEP = 0.01
 TOLERANCE = 0.02
 # noise of samples that is assumed: sensor [sr^-1], and geometry, relative
