@@ -84,8 +84,8 @@ def write_laboratory(
             {"ball": {"radius": BALL_RADIUS}, "chart": {"pitch": CHART_PITCH}},
         ),
     ):
-        file = private_file(folder / f"dome/{name}.json")
-        file.write_text(json.dumps(content, indent=1), encoding="utf-8")
+        text = json.dumps(content, indent=1)
+        private_file(folder / f"dome/{name}.json").write_text(text, encoding="utf-8")
 
 
 def rehearsed_dome(dome: DomeRecord) -> tuple[Dome, Sensor]:
