@@ -53,8 +53,9 @@ def _package(folder: Path, **modules: str) -> Path:
 
 
 def _printed(code: str, folder: Path, **environment: str) -> str:
+    # without bytecode, which Python compares with sources by whole seconds only
     done = subprocess.run(
-        [sys.executable, "-c", code],
+        [sys.executable, "-B", "-c", code],
         cwd=folder,
         env=os.environ | environment,
         capture_output=True,
