@@ -20,6 +20,7 @@ from skindb.limits import MAX_BALL_PLACES, MAX_CAMERAS
 from skindb.types import Array, Float64, Index, float64
 
 FILE = "dome/boards.json"
+PAGE = "docs/howto/calibrate.md"
 POSE = "pose"
 DICTIONARY = "DICT_5X5_100"
 MIN_CORNERS = 8  # in a picture
@@ -64,7 +65,7 @@ def read_boards(folder: Path) -> Boards:
     path = folder / FILE
     cv2 = opencv(path)
     faults = list[Fault]()
-    fields = Fields(read_json(path, faults), str(path), faults)
+    fields = Fields(read_json(path, faults), str(path), faults, PAGE)
     template = fields.template("frames", {CAMERA, POSE})
     count = fields.integer("poses", minimum=MIN_POSES, maximum=MAX_BALL_PLACES)
     squares = fields.array("squares", (2,)).astype(int)

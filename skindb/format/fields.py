@@ -33,7 +33,8 @@ REQUIRED: Any = object()
 FEWER = "remove those that are not needed"
 MAX_MAGNITUDE = 1e30  # squares of larger numbers exceed the range of single precision
 MAX_SHOWN_CHARACTERS = 100  # of a key or value in a message
-CURE = "correct it, see docs/capture_format.md"
+PAGE = "docs/capture_format.md"
+CURE = f"correct it, see {PAGE}"
 
 
 class TextRule(NamedTuple):
@@ -52,18 +53,26 @@ IDENTIFIER = TextRule(
 
 class Fields:
     """The keys of one JSON object; a faulty value is recorded in `faults` and replaced
-    by a valid default.
+    by a valid default. `page` describes the file.
     """
 
-    def __init__(self, data: Any, where: str, faults: list[Fault]) -> None:
+    def __init__(
+        self, data: Any, where: str, faults: list[Fault], page: str = PAGE
+    ) -> None:
         self.where = where
         self.faults = faults
+        self.page = page
         self.used = set[str]()
         # otherwise missing keys are not reported in addition
         self.is_object = isinstance(data, dict)
         if not self.is_object:
             faults.append(
-                Fault(where, "must be a JSON object {...}", shown(data), CURE)
+                Fault(
+                    where,
+                    "must be a JSON object {...}",
+                    shown(data),
+                    f"correct it, see {page}",
+                )
             )
         self.data: dict[str, Any] = data if self.is_object else {}
 
@@ -71,8 +80,9 @@ class Fields:
         """Location of `key` in a message."""
         return f"{self.where}[{short(key)}]"
 
-    def fault(self, key: str, rule: str, found: str, cure: str = CURE) -> None:
+    def fault(self, key: str, rule: str, found: str, cure: str = "") -> None:
         """Record a fault of `key`; `found` is a phrase, for a value the result of `shown`."""
+        cure = cure or f"correct it, see {self.page}"
         self.faults.append(Fault(self.place(key), rule, found, cure))
 
     def has(self, key: str) -> bool:
@@ -88,17 +98,13 @@ class Fields:
         if default is not REQUIRED:
             return default
         if self.is_object:
-            self.fault(
-                key,
-                "this key is required",
-                "nothing",
-                "add it, see docs/capture_format.md",
-            )
+            cure = f"add it, see {self.page}"
+            self.fault(key, "this key is required", "nothing", cure)
         return None
 
     def object(self, key: str, default: Any = REQUIRED) -> Fields:
         """The JSON object under a key."""
-        return Fields(self.get(key, default), self.place(key), self.faults)
+        return Fields(self.get(key, default), self.place(key), self.faults, self.page)
 
     def rest(self) -> dict[str, Any]:
         """Keys that were not read, with their values; they are kept as attributes."""
@@ -286,7 +292,7 @@ class Fields:
         if not self._within(key, value, maximum):
             return []
         items = [
-            Fields(item, f"{self.where}[{key}][{i}]", self.faults)
+            Fields(item, f"{self.where}[{key}][{i}]", self.faults, self.page)
             for i, item in enumerate(value)
         ]
         self._require_unique(key, [item.data.get("id") for item in items])

@@ -5,7 +5,6 @@ import subprocess
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 
 from skindb.errors import Fault, SkindbWarning, require_none
@@ -16,6 +15,7 @@ from skindb.hw.cameras import FolderCameras, Shot
 from skindb.limits import MAX_CAMERAS
 
 STREAMS = "cameras.json"  # in the folder of the frames
+PAGE = "docs/howto/capture.md"
 PYTHON = "/usr/bin/python3"  # that has the bindings of Aravis
 END_SECONDS = 10.0  # to write what was received
 
@@ -41,7 +41,7 @@ class StreamingCameras(FolderCameras):
     def __init__(self, root: Path, ids: Sequence[str]) -> None:
         faults = list[Fault]()
         path = root / STREAMS
-        fields = Fields(read_json(path, faults), str(path), faults)
+        fields = Fields(read_json(path, faults), str(path), faults, PAGE)
         streams = {
             item.text("id", rule=IDENTIFIER): (
                 item.text("device"),
@@ -58,8 +58,7 @@ class StreamingCameras(FolderCameras):
             fields.fault(
                 "cameras", "are streamed by Aravis", f"no {PYTHON}", aravis.PACKAGES
             )
-        pages = ("docs/capture_format.md", "docs/howto/capture.md")
-        require_none([replace(f, cure=f.cure.replace(*pages)) for f in faults])
+        require_none(faults)
         for name in ids:
             make_private(root / name)
         super().__init__(root, ids)
