@@ -5,6 +5,7 @@ dome.
 import json
 import os
 import tempfile
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +92,7 @@ def measured_cameras(folder: Path) -> tuple[Json, Json]:
 
 def write_geometry(folder: Path, record: Json, positions: xr.Dataset) -> None:
     """Replace the dome.json of a set-up by one with calibrated cameras and lights, which face
-    the origin.
+    the origin. One that had cameras is kept as dome.1.json, dome.2.json, ...
     """
     place = dict(
         zip(
@@ -106,6 +107,11 @@ def write_geometry(folder: Path, record: Json, positions: xr.Dataset) -> None:
         for light in record["lights"]
     ]
     file = folder / "dome/dome.json"
+    before = file.read_bytes()
+    if any("K" in camera for camera in json.loads(before)["cameras"]):
+        names = (file.with_suffix(f".{number}.json") for number in count(1))
+        kept = next(name for name in names if not name.exists())
+        private_file(kept).write_bytes(before)
     temporary = file.with_suffix(".new")
     _dump(temporary, record | {"lights": lights})
     temporary.replace(file)

@@ -227,3 +227,7 @@ def test_calibrate__completes_a_dome_without_geometry(lab, tmp_path):
     report = workflow.describe_calibration(db, version)
     assert report["boards"]["cameras"] == 2
     assert report["cameras"]["known points"]["reprojection_rms"] < 0.5
+    completed = (lab / "dome/dome.json").read_text()
+    workflow.calibrate(db, lab, name="dome-a")
+    assert (lab / "dome/dome.1.json").read_text() == completed
+    assert not (lab / "dome/dome.2.json").exists()
