@@ -31,6 +31,7 @@ from skindb.format.folder import Capture
 from skindb.format.frames import Digests
 from skindb.geometry.rays import RayScene
 from skindb.ingest.consistency import CalibrationCheck
+from skindb.ingest.detail import pixel_width
 from skindb.ingest.faults import (
     calibration_faults,
     calibration_notes,
@@ -80,6 +81,9 @@ from skindb.types import Float64, Half, Progress, silent
 
 MIN_THREADS = 2  # with two, one reads while the other computes
 MAX_THREADS = 8
+# width of a pixel over the spacing of the surfels from which on neighbours share pixels: at 2.4,
+# 52 to 58 % of R_d at points are within one standard error, of R_d over a pixel 66 to 72 %
+COARSE_PIXEL = 1.5
 MAX_BYTES = 4 << 30  # of memory for all threads together, unless two threads need more
 
 
@@ -437,6 +441,12 @@ class _DomeRun(_Run):
         levels = lumitexels.views
         for merger in mergers.values():
             self.notes += dark_notes(dome, merger)
+        pixel = pixel_width(self.surfels, dome.cameras)
+        if pixel > COARSE_PIXEL * self.surfels.spacing():
+            self.notes.append(
+                f"a pixel is {pixel:.2g} mm wide on the face: values of surfels are means "
+                "over its width, and their errors do not contain finer detail"
+            )
         self.notes += level_notes(dome, levels.highest, levels.clipped)
         self.notes += light_notes(dome, intensity, levels.median)
         calibration = lumitexels.calibration

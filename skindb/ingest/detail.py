@@ -49,6 +49,12 @@ BLUR_PIXELS = 0.5
 WINDOW = 6.0
 
 
+def pixel_width(surfels: SurfelSet, cameras: Sequence[CameraRecord]) -> float:
+    """Median width [mm] of a pixel on the surface."""
+    middle = surfels.position.mean(axis=0)
+    return float(np.median([camera.pixel_width(middle) for camera in cameras]))
+
+
 class CameraSampling(NamedTuple):
     """Where and how one camera samples the surfels, the same under every light."""
 
@@ -76,8 +82,7 @@ class Detail:
     @classmethod
     def of(cls, surfels: SurfelSet, cameras: Sequence[CameraRecord]) -> Self | None:
         """The points of a capture; None if its photographs are not finer than its surfels."""
-        middle = surfels.position.mean(axis=0)
-        pixel = np.median([camera.pixel_width(middle) for camera in cameras])
+        pixel = pixel_width(surfels, cameras)
         if surfels.spacing() < MIN_SPACING_PIXELS * pixel:
             return None
         in_map = np.abs(signed_areas(surfels.uv, surfels.faces)).sum()

@@ -568,6 +568,17 @@ def test_ingest_capture__what_no_light_and_camera_reach_is_not_committed(
     assert db.takes("capture") == []
 
 
+@pytest.mark.parametrize(("part", "noted"), [(0.5, True), (0.8, False)])
+def test_ingest_capture__pixels_wider_than_the_spacing_are_noted(
+    capture_folder, tmp_path, part, noted
+):
+    camera = read_capture(capture_folder).dome.cameras[0]
+    spacing = part * camera.pixel_width(np.zeros(3))
+    record = ingest_take(Database(tmp_path / "db"), capture_folder, spacing_mm=spacing)
+    notes = record.provenance["summary"]["notes"]
+    assert noted == any("values of surfels are means over" in note for note in notes)
+
+
 def test_ingest_capture__a_database_is_not_kept_in_the_capture(capture_folder):
     for root in (capture_folder, capture_folder / "dome" / "db"):
         with pytest.raises(
