@@ -503,6 +503,7 @@ def plot_basis_size(curves: Mapping[str, Dataset], *, ax: Axes | None = None) ->
         ax.plot(k[chosen], error[chosen], linestyle="none", **style)
     ax.set_xlabel("number of basis BRDFs k (filled: sizes that may suffice)")
     ax.set_yscale("log", nonpositive="clip")
+    ax.yaxis.set_major_formatter("{x:g}")  # formulas are not parsed
     ax.set_ylabel("error above that of the dictionary [%]")
     ax.legend(fontsize=8)
     return ax

@@ -359,9 +359,7 @@ def plot_traits(traits: Dataset, *, ax: Axes | None = None) -> Axes:
     ]
     ax.set_yticks(range(len(counts)), counts)
     ax.set_xlabel("component of the common basis")
-    ax.figure.colorbar(
-        image, ax=ax, label="difference of the coefficient with and without the trait"
-    )
+    ax.figure.colorbar(image, ax=ax, label="coefficient with minus without")
     return ax
 
 

@@ -272,6 +272,7 @@ function listen() {
     event.currentTarget.setAttribute("aria-expanded", String(!open));
     redraw();
   });
+  if (self !== top) $("sheet").click(); // a small frame in another page shows the picture
 }
 
 function fingers(pointers) {
