@@ -21,9 +21,7 @@ from skindb.calibration.irradiance import (
     light_intensities,
     target_pixels,
 )
-from skindb.calibration.lights import (
-    calibrate_lights,
-)
+from skindb.calibration.lights import calibrate_lights
 from skindb.calibration.radiance import frame_mergers, merge_exposures, read_view
 from skindb.calibration.response import recover_response
 from skindb.format.folder import read_capture

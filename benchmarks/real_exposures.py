@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from skimage.io import imread
 
-from skindb.calibration.lights import ball_outline, distant_light, highlight_centre
+from skindb.calibration.mirror_ball import ball_outline, distant_light, highlight_centre
 from skindb.calibration.response import (
     recover_response,
     response_samples,

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from skindb.calibration.boards import MIN_CORNERS, board_corners
-from skindb.calibration.lights import highlight_of
+from skindb.calibration.mirror_ball import highlight_of
 from skindb.errors import Fault, few_names
 from skindb.format.dome import CameraRecord
 from skindb.format.frames import read_frame

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from skindb.calibration.lights import ball_outline, distant_light, highlight_centre
+from skindb.calibration.mirror_ball import ball_outline, distant_light, highlight_centre
 from skindb.errors import Fault, attempt, few_names, require, require_none
 from skindb.files import make_private, private_file, read_regular
 from skindb.format.dome import EXPOSURE_RATIO

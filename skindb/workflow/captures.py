@@ -17,13 +17,13 @@ from skindb.calibration.cameras import calibrate_cameras, calibrated_cameras
 from skindb.calibration.fibres import calibrate_probe, calibrated_probe
 from skindb.calibration.lights import (
     calibrate_lights,
-    calibrate_positions,
     calibrated_dome,
     is_same_rig,
     positioned_dome,
     rig_dome,
     rig_positions,
 )
+from skindb.calibration.mirror_ball import calibrate_positions
 from skindb.calibration.setup import FILE as CALIBRATION_FILE
 from skindb.calibration.setup import (
     read_calibration_frames,

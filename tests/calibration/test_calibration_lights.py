@@ -13,7 +13,8 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from skindb.calibration.cameras import reprojection_error
-from skindb.calibration.lights import (
+from skindb.calibration.lights import positioned_dome
+from skindb.calibration.mirror_ball import (
     Outline,
     ball_centre,
     ball_outline,
@@ -22,7 +23,6 @@ from skindb.calibration.lights import (
     distant_light,
     highlight_centre,
     light_position,
-    positioned_dome,
     reflected_ray,
 )
 from skindb.calibration.setup import read_calibration_frames, read_setup_dome
