@@ -41,3 +41,21 @@ def opened(browser, address, *, width=620, height=320, motion="reduce"):
     page.evaluate("skindb.ready")
     assert "token" not in page.url
     return page
+
+
+def inaccessible(page):
+    """What axe objects to, with all parts of the page open."""
+    axe = pytest.importorskip(
+        "axe_playwright_python.sync_playwright",
+        reason="axe-playwright-python is not installed",
+    )
+    page.evaluate(
+        "document.querySelectorAll('details').forEach((one) => { one.open = true; })"
+    )
+    result = axe.Axe().run(page)
+    assert result.response["passes"] is not None
+    return [
+        (rule["id"], node["html"][:120])
+        for rule in result.response["violations"]
+        for node in rule["nodes"]
+    ]

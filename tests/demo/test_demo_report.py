@@ -8,6 +8,7 @@ import re
 import imagecodecs
 import numpy as np
 import pytest
+from browser_page import inaccessible
 from planted_results import (
     DIFFUSE_ERROR,
     HELD_OUT_ERROR,
@@ -148,6 +149,7 @@ def test_write_report__fits_a_narrow_page(report, browser, theme):
     assert page.evaluate("document.documentElement.scrollWidth") == 400
     unnamed = "[...document.images].filter(one => !one.alt || !one.naturalWidth).length"
     assert page.evaluate(unnamed) == 0
+    assert inaccessible(page) == []
     files = [
         report.as_uri(),
         report.with_name("viewer.html").as_uri(),

@@ -8,7 +8,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import numpy as np
 import pytest
 import trimesh
-from browser_page import opened
+from browser_page import inaccessible, opened
 from page_session import Session, running
 from waiting import wait_until
 
@@ -361,4 +361,10 @@ def test_landmark_page__names_are_data(server, browser, tmp_path):
     assert page.title() == "Landmarks of scan.ply"
     assert page.evaluate("Object.keys(skindb.state.points)") == [name]
     assert not page.problems
+    page.close()
+
+
+def test_page__is_accessible(browser, address):
+    page = opened(browser, address, width=860, height=500)
+    assert inaccessible(page) == []
     page.close()

@@ -10,6 +10,7 @@ import imagecodecs
 import numpy as np
 import pytest
 import xarray as xr
+from browser_page import inaccessible
 from browser_page import opened as opened_page
 from page_session import running
 from scipy.ndimage import binary_erosion
@@ -772,8 +773,16 @@ def test_page__a_photograph_lies_on_the_model(browser, model, tmp_path):
     assert difference.mean() < 0.005
     text = page.inner_text("#photographed")
     assert text == "light l1, camera c0: not seen by the fit"
+    assert inaccessible(page) == []
     page.click("#leave")
     after = page.evaluate("({...skindb.state, lights: 0})")
     assert after == before | {"through": None}
     assert not page.problems
+    page.close()
+
+
+@pytest.mark.parametrize("width", [1200, 400])
+def test_page__is_accessible(browser, page_file, width):
+    page = opened(browser, page_file.as_uri(), width=width, height=800)
+    assert inaccessible(page) == []
     page.close()
