@@ -101,9 +101,9 @@ def check_device(url: str) -> None:
     """Compare a light controller or a probe with docs/protocol.md.
 
     PORT is a serial port or socket://HOST:PORT. Every exchange of the page that needs no
-    hands is tried: damaged and repeated lines, refusals, a plan with three flashes,
-    reports, emergency stop and watchdog, or pressure and an exposure. Nobody should be in
-    the dome or at the probe.
+    hands is tried, in half a minute: damaged and repeated lines, refusals, plans with some
+    twenty flashes, reports, emergency stop and watchdog, or pressure and exposures. Nobody
+    should be in the dome or at the probe.
     """
     kind, faults = workflow.check_device(url)
     emit({"kind": kind}, [] if faults else [f"{url}: a {kind} that agrees"], faults)

@@ -291,11 +291,12 @@ class EmulatedDome(Emulated):
             raise RefusedError(f"no light {step.light}")
         if int(values["index"]) != len(self.steps):
             raise RefusedError(f"step {len(self.steps)} comes next")
-        if step.off_us <= step.on_us or (
+        if not 0 <= step.on_us < step.off_us or (
             self.steps and step.on_us < self.steps[-1].off_us
         ):
             raise RefusedError("steps must not overlap, and end after they begin")
         self.steps.append(step)
+        self.state = "idle" if self.state == "armed" else self.state
         return {}
 
     def _digest(self) -> str:
@@ -331,6 +332,7 @@ class EmulatedDome(Emulated):
         self._start = self.clock.monotonic()
         self._runs += 1
         self._done = 0
+        self.steps = [replace(step, measured={}, lit=False) for step in self.steps]
         return {}
 
     def _status(self, _: dict[str, str]) -> dict[str, object]:
@@ -343,6 +345,10 @@ class EmulatedDome(Emulated):
         }
 
     def _halt(self, reason: str) -> dict[str, object]:
+        step = self.steps[self._done] if self._done < len(self.steps) else None
+        if self.state == "running" and step is not None and step.lit:
+            elapsed = (self.clock.monotonic() - self._start) * 1e6
+            step.measured["off"] = min(round(elapsed), step.off_us)
         self.on = None
         if self.state in ("running", "armed"):
             self.state = "stopped"
@@ -402,6 +408,8 @@ class EmulatedProbe(Emulated):
             self._next = now
             self._lit = np.inf
         elif verb == "LED":
+            if values["on"] not in ("0", "1"):
+                raise RefusedError("on must be 1 or 0")
             self.led = values["on"] == "1"
             self._lit = now
         elif verb == "EXPOSE":
@@ -409,7 +417,7 @@ class EmulatedProbe(Emulated):
         elif verb == "STATUS":
             state = "exposing" if now < self._until else "idle"
             return {"state": state, "triggers": self._triggers}
-        elif verb in ("STOP", "VENT"):
+        elif verb == "STOP":
             self._release()
         elif verb != "BEAT":
             raise RefusedError(f"unknown verb {verb}")
