@@ -3,30 +3,42 @@ by formulas, photographed at 0.3 mm per pixel, fitted, and rendered from its mod
 
     python -m benchmarks hero --out FOLDER
 
-writes the capture, a database and pictures into FOLDER. `--stage` repeats a part of it.
+writes the capture, a database, the page of the viewer and the pictures of the documentation into
+FOLDER. A capture that exists is not photographed again.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import resource
+import shutil
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import trimesh
+import xarray as xr
 from numpy.typing import ArrayLike
+from PIL import Image
 from scipy.interpolate import make_interp_spline
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
 import skindb
 from skindb import workflow
+from skindb.demo.page import map_pictures
 from skindb.geometry.mesh import edge_table, subdivide, vertex_areas, vertex_normals
 from skindb.parameters import FitParameters
 from skindb.reflectance.mixture import Mixture
+from skindb.render.image import shown_part, tone_map
+from skindb.render.photographs import (
+    Comparison,
+    compare_photographs,
+)
 from skindb.render.scene import Surface
 from skindb.types import Array, Index, lengths, unit
 from skindb.virtual.capture import (
@@ -40,7 +52,8 @@ from skindb.virtual.dome import CENTRE, Dome, Sensor, build_dome, photograph
 from skindb.virtual.face import FaceShape, region_membership
 from skindb.virtual.head import Head
 from skindb.virtual.person import Person
-from skindb.virtual.skin import skin_of, skin_tables, smooth_noise
+from skindb.virtual.probe import write_probe
+from skindb.virtual.skin import Site, skin_of, skin_tables, smooth_noise
 
 SHAPE = FaceShape(lip_fullness=0.3, brow=0.6, nose_width=11.5, mouth_width=25.5)
 PERSON = Person(
@@ -61,12 +74,17 @@ EYE_RADIUS = 13.0
 EAR = np.array([73.0, 22.0, -6.0])
 GRADIENT_MM = 0.02
 SAMPLES = 200  # of a wrinkle
+ETA = 1.3
 HAIR_MM = 1.6
 OPACITY = {"cut": 0.85, "brow": 0.8, "lash": 0.75, "stubble": 0.62}
 PORES = {"nose": 0.9, "cheek": 0.5, "forehead": 0.3, "chin": 0.4}  # mm^-2
 FRAME_MM = (222.0, 318.0)  # of a picture, on the face
 MIDDLE = np.array([0.0, 2.0, 10.0])  # of the pictures
 SCAN_MM = 2.4
+MAX_BYTES = 150_000  # of a picture of the documentation
+EXPOSED = 1.1  # brightness of the figures
+LIGHTS_FROM = ("70,25", "10,30")  # azimuth and elevation [degrees]
+VIEWER_MS = 8000  # until the page has drawn its final picture
 KEPT = 4  # photographs that ingest keeps
 HAIR_COLOUR = np.array([0.040, 0.029, 0.022])
 
@@ -338,7 +356,7 @@ def broad_relief(points: Array) -> Array:
     rng = np.random.default_rng([PERSON.seed, 20])
     lumps = [(40, 0.30), (16, 0.10), (7, 0.03)]
     total = sum(a * smooth_noise(points, w, rng=rng) for w, a in lumps)
-    return total + HAIR_MM * hair_line(points)
+    return total + HAIR_MM * hair_line(points) ** 3  # the rim is in the hair
 
 
 def curve(places: ArrayLike, depth: float, width: float) -> tuple[Array, float, float]:
@@ -473,9 +491,10 @@ class Hero:
     normals: Array  # (n, 3)
     diffuse: Array  # (n, 3) R_d
     weights: Array  # (n, k) of the materials of the virtual dome
+    sites: tuple[Site, ...]  # of the contact probe
 
 
-class Site:
+class Place:
     """Where the vertices (n,) of the smooth head are on the face."""
 
     def __init__(self, smooth: Array, faces: Index) -> None:
@@ -522,77 +541,81 @@ class Site:
         return strands(self.points, root, lying, length, width, rng)
 
 
-def hairs(site: Site, rng: np.random.Generator) -> dict[str, Array]:
+def hairs(place: Place, rng: np.random.Generator) -> dict[str, Array]:
     """Cover (n,) of the skin by each kind of hair."""
-    member = site.member
-    down = np.broadcast_to([0.0, -1.0, 0.0], site.points.shape)
-    from_crown = site.points - np.array([4.0, 168.0, -71.0])
-    lid = (np.abs(site.x - EYE[0]) < 13.5) & (site.z > 70)
-    at_lid = 9.0 * bell((site.y - lid_line(site.x) - 0.1) / 0.35) * lid
-    outward = (site.x - 14) / 36
-    along_brow = np.stack([site.side, 0.9 - 1.5 * outward, -0.9 * outward], axis=1)
+    member = place.member
+    down = np.broadcast_to([0.0, -1.0, 0.0], place.points.shape)
+    from_crown = place.points - np.array([4.0, 168.0, -71.0])
+    lid = (np.abs(place.x - EYE[0]) < 13.5) & (place.z > 70)
+    at_lid = 9.0 * bell((place.y - lid_line(place.x) - 0.1) / 0.35) * lid
+    outward = (place.x - 14) / 36
+    along_brow = np.stack([place.side, 0.9 - 1.5 * outward, -0.9 * outward], axis=1)
     over_lid = np.stack(
-        [site.side * 0.05 * (site.x - 27), -np.ones_like(site.x), 0 * site.x], axis=1
+        [place.side * 0.05 * (place.x - 27), -np.ones_like(place.x), 0 * place.x],
+        axis=1,
     )
-    cut = site.grown(1.1 * site.hair, 0.45, from_crown, 2.6, 0.2, rng)
-    in_brow = 1.6 * member["brow"] * (site.z > 40)
+    cut = place.grown(1.1 * place.hair, 0.45, from_crown, 2.6, 0.2, rng)
+    in_brow = 1.6 * member["brow"] * (place.z > 40)
     return {
-        "cut": cut * step(site.hair - 0.1, 0.1),
-        "brow": site.grown(in_brow, 0.35, along_brow, 6.0, 0.2, rng),
-        "lash": site.grown(at_lid, 0.3, over_lid, 3.2, 0.16, rng),
-        "stubble": site.beard
-        * site.grown(0.45 * site.beard, 0.6, down, 0.5, 0.17, rng),
+        "cut": cut * step(place.hair - 0.1, 0.1),
+        "brow": place.grown(in_brow, 0.35, along_brow, 6.0, 0.2, rng),
+        "lash": place.grown(at_lid, 0.3, over_lid, 3.2, 0.16, rng),
+        "stubble": place.beard
+        * place.grown(0.45 * place.beard, 0.6, down, 0.5, 0.17, rng),
     }
 
 
-def pores_of(site: Site, rng: np.random.Generator) -> Array:
+def pores_of(place: Place, rng: np.random.Generator) -> Array:
     """Depth (n,) in [0, 1] of the pores, which are dense on the nose."""
-    density = 0.25 + sum(PORES[name] * site.member[name] for name in PORES)
-    centre = spread(site.points, site.area, density * site.bare, 0.75, rng)
-    return pore_depth(site.points, site.points[centre], rng)
+    density = 0.25 + sum(PORES[name] * place.member[name] for name in PORES)
+    centre = spread(place.points, place.area, density * place.bare, 0.75, rng)
+    return pore_depth(place.points, place.points[centre], rng)
 
 
 def build_hero(spacing: float = 1.6, levels: int = 2) -> Hero:
     """The head with its relief and skin; the vertices are `spacing` / 2^levels mm apart."""
     smooth, faces = sculpt(spacing, levels)
     rng = np.random.default_rng([PERSON.seed, 21])
-    site = Site(smooth, faces)
-    pores = pores_of(site, rng)
+    place = Place(smooth, faces)
+    pores = pores_of(place, rng)
     lines = furrows(smooth, rng)
     net = sum(bell(smooth_noise(smooth, wave, rng=rng) / 0.3) for wave in (2.2, 3.4))
-    net = net * (1 - site.hair)
-    cover = hairs(site, rng)
+    net = net * (1 - place.hair)
+    cover = hairs(place, rng)
     height = broad_relief(smooth) + lines - 0.10 * pores - 0.018 * net
     height += 0.22 * cover["cut"] + 0.18 * cover["brow"] + 0.08 * cover["stubble"]
-    vertices = smooth + height[:, None] * site.normals
+    vertices = smooth + height[:, None] * place.normals
     parts = {"brow": 0.7, "lash": 0.7, "lips": 0.75, "neck": 0.4}
-    member = {name: parts.get(name, 1.0) * m for name, m in site.member.items()}
-    head = Head(vertices, faces, site.normals, {}, member)
+    member = {name: parts.get(name, 1.0) * m for name, m in place.member.items()}
+    head = Head(vertices, faces, place.normals, {}, member)
     _, albedo = _materials()
-    skin = skin_of(head, PERSON, material_albedo=albedo, eta=1.3)
-    dark = 0.26 * pores + 0.035 * net * site.bare - 0.55 * np.minimum(lines, 0)
-    gloss = 1 - 0.85 * np.max([site.hair, cover["brow"], 0.4 * pores], axis=0)
+    skin = skin_of(head, PERSON, material_albedo=albedo, eta=ETA)
+    dark = 0.26 * pores + 0.035 * net * place.bare - 0.55 * np.minimum(lines, 0)
+    gloss = 1 - 0.85 * np.max([place.hair, cover["brow"], 0.4 * pores], axis=0)
     return Hero(
         vertices,
         faces,
         vertex_normals(vertices, faces),
-        painted(site, skin.diffuse, np.clip(dark, 0, 0.6), cover),
+        painted(place, skin.diffuse, np.clip(dark, 0, 0.6), cover),
         skin.weights * gloss[:, None],
+        skin.sites,
     )
 
 
-def painted(site: Site, diffuse: Array, dark: Array, cover: dict[str, Array]) -> Array:
+def painted(
+    place: Place, diffuse: Array, dark: Array, cover: dict[str, Array]
+) -> Array:
     """R_d (n, 3) of skin with redder parts, what pores and wrinkles darken, and hair."""
     red = (
-        0.14 * site.ear
-        + 0.16 * site.around(40, 2, 13, 13, 30)
-        + 0.18 * site.around(0, 4, 13, 9, 95)
-        + 0.22 * site.around(30, 22, 12, 6, 60)
-        + 0.10 * site.around(12, 2, 5, 6, 80)
+        0.14 * place.ear
+        + 0.16 * place.around(40, 2, 13, 13, 30)
+        + 0.18 * place.around(0, 4, 13, 9, 95)
+        + 0.22 * place.around(30, 22, 12, 6, 60)
+        + 0.10 * place.around(12, 2, 5, 6, 80)
     )
     skin = diffuse * np.exp(-np.outer(red, skin_tables().haemoglobin))
     skin *= 1 - dark[:, None] * np.array([0.8, 1.0, 1.05])
-    clear = (1 - 0.10 * site.beard) * (1 - 0.80 * site.hair)
+    clear = (1 - 0.10 * place.beard) * (1 - 0.80 * place.hair)
     for name, opacity in OPACITY.items():
         clear = clear * (1 - opacity * cover[name])
     mixed = skin * clear[:, None] + HAIR_COLOUR * (1 - clear[:, None])
@@ -626,9 +649,19 @@ def close_dome(lights: int, cameras: int, pixel_mm: float) -> Dome:
 
 
 def write_capture(out: Path, hero: Hero, dome: Dome) -> None:
-    """Photograph the head into the capture folder `out`."""
+    """Write the capture folder `out`: contact with the probe, scan, and photographs."""
     sensor = Sensor()
-    (out / "dome").mkdir(parents=True)
+    for site in hero.sites:
+        (out / "contact" / site.name).mkdir(parents=True)
+    write_probe(out, hero.sites, eta=ETA, rng=np.random.default_rng([PERSON.seed, 2]))
+    vertices, faces = sculpt(SCAN_MM)
+    vertices += broad_relief(vertices)[:, None] * normals(vertices)
+    trimesh.Trimesh(vertices, faces, process=False).export(out / "scan.ply")
+    member = region_membership(even(vertices).T, SHAPE)
+    regions = {
+        name: [np.flatnonzero(member[name] > 0.5).tolist()] for name in SCAN_REGIONS
+    }
+    (out / "dome").mkdir()
     photograph(
         out,
         surface_of(hero),
@@ -638,28 +671,111 @@ def write_capture(out: Path, hero: Hero, dome: Dome) -> None:
         rng=np.random.default_rng([PERSON.seed, 1]),
         step=lambda: None,
     )
-    vertices, faces = sculpt(SCAN_MM)
-    vertices += broad_relief(vertices)[:, None] * normals(vertices)
-    trimesh.Trimesh(vertices, faces, process=False).export(out / "scan.ply")
-    member = region_membership(even(vertices).T, SHAPE)
-    regions = {
-        name: [np.flatnonzero(part > 0.5).tolist()]
-        for name, part in member.items()
-        if name in SCAN_REGIONS
-    }
     for name, content in (
         ("regions.json", regions),
         ("dome/dome.json", dome_record(dome, sensor, session_time(PERSON))),
-        ("capture.json", capture_record(PERSON, contact=False, landmarks=False)),
+        ("capture.json", capture_record(PERSON, contact=True, landmarks=False)),
     ):
         (out / name).write_text(json.dumps(content), encoding="utf-8")
+
+
+def print_errors(kind: str, comparisons: Sequence[Comparison]) -> None:
+    """Print how well a model predicts each photograph."""
+    names = ("fine_contrast", "fine_gain", "relative_rmse", "ssim")
+    for one in comparisons:
+        numbers = [f"{name} {one.error[name]:.3f}" for name in names]
+        seen = "held out" if one.held_out else "fitted"
+        print(kind, one.light, one.camera, seen, *numbers, sep="  ")
+
+
+def write_pictures(
+    out: Path, model: xr.DataTree, comparisons: Sequence[Comparison]
+) -> None:
+    """Write the figures of the documentation."""
+    part = shown_part([one.mask for one in comparisons], 12)
+    exposure = EXPOSED * min(one.error["exposure"] for one in comparisons)
+
+    def panel(image: Array) -> Array:
+        return tone_map(np.nan_to_num(image[part]), exposure=exposure)
+
+    held_out = [one for one in comparisons if one.held_out]
+    held_out = sorted(held_out, key=lambda one: one.error["relative_rmse"])[:3]
+    rows = [
+        np.concatenate([panel(getattr(one, kind)) for one in held_out], axis=1)
+        for kind in ("photographed", "rendered")
+    ]
+    save(out / "hero.webp", np.concatenate(rows), 900)
+    best = held_out[0]
+    maps = [image for image, _ in map_pictures({PERSON.take: model})[PERSON.take][:4]]
+    height = 2 * min(len(image) for image in maps)
+    small = [resized(image, height // 2) for image in maps]
+    width = min(image.shape[1] for image in small)
+    small = [image[:, :width] for image in small]
+    grid = np.concatenate(
+        [np.concatenate(small[:2], axis=1), np.concatenate(small[2:], axis=1)]
+    )
+    large = [
+        resized(panel(image), height) for image in (best.photographed, best.rendered)
+    ]
+    save(out / "overview.webp", np.concatenate([*large, grid], axis=1), 1000)
+
+
+def render_head(db: skindb.Database, out: Path) -> None:
+    """Write pictures of the head from another side, with light under the skin."""
+    pictures = []
+    for direction in LIGHTS_FROM:
+        path = out / f"light_{direction}.png"
+        options: dict[str, Any] = {"view": "three-quarter", "light_from": direction}
+        options |= {"size": 450, "exposure": "auto", "subsurface": True}
+        workflow.render_take(db, path, PERSON.take, **options)
+        pictures.append(np.asarray(Image.open(path).convert("RGB")))
+    save(out / "render.webp", np.concatenate(pictures, axis=1), 900)
+
+
+def photograph_viewer(page: Path, picture: Path) -> None:
+    """Write a picture of the viewer's page in Chromium with software rendering."""
+    from playwright.sync_api import sync_playwright  # an extra
+
+    from benchmarks.viewer import FLAGS
+
+    with sync_playwright() as running:
+        browser = running.chromium.launch(
+            executable_path=shutil.which("chromium"), args=FLAGS
+        )
+        tab = browser.new_page(
+            viewport={"width": 900, "height": 560}, reduced_motion="reduce"
+        )
+        tab.set_default_timeout(0)
+        tab.goto(page.resolve().as_uri())
+        tab.evaluate("skindb.ready")
+        tab.wait_for_timeout(VIEWER_MS)
+        shot = tab.screenshot()
+        browser.close()
+    save(picture, np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")), 900)
+
+
+def resized(picture: Array, height: int) -> Array:
+    """A picture (h, w, 3) of 8 bits with another height."""
+    width = round(picture.shape[1] * height / len(picture))
+    small = Image.fromarray(picture).resize((width, height), Image.Resampling.LANCZOS)
+    return np.asarray(small)
+
+
+def save(path: Path, picture: Array, width: int) -> None:
+    """Write a picture of at most `width` pixels and 150 kB."""
+    image = Image.fromarray(picture)
+    image.thumbnail((width, 4 * width), Image.Resampling.LANCZOS)
+    for quality in range(90, 40, -5):
+        image.save(path, quality=quality, method=6)
+        if path.stat().st_size <= MAX_BYTES:
+            break
 
 
 def main(
     *,
     out: Annotated[Path, "Folder of the capture, the database and the pictures."],
     lights: Annotated[int, "Number of lights."] = 32,
-    cameras: Annotated[int, "Number of cameras."] = 5,
+    cameras: Annotated[int, "Number of cameras."] = 8,
     pixel: Annotated[float, "Width of a pixel on the face [mm]."] = 0.3,
     spacing: Annotated[float, "Distance of the surfels [mm]."] = 1.0,
 ) -> None:
@@ -671,17 +787,35 @@ def main(
     def report(stage: str) -> None:
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
         seconds = time.perf_counter() - begin
-        print(f"{stage}: {seconds:.0f} s, at most {memory:.2f} GiB", flush=True)
+        print(
+            f"{stage}: {seconds:.0f} s, {time.process_time():.0f} s of CPU time, at most "
+            f"{memory:.2f} GiB",
+            flush=True,
+        )
 
-    capture = out / PERSON.take
-    if not (capture / "capture.json").exists():
-        hero = build_hero(4.67 * pixel)
+    folder = out / PERSON.take
+    if not (folder / "capture.json").exists():
+        hero = build_hero(min(4.67 * pixel, SCAN_MM))
         report(f"head of {len(hero.vertices):,} vertices")
-        write_capture(capture, hero, close_dome(lights, cameras, pixel))
+        write_capture(folder, hero, close_dome(lights, cameras, pixel))
         report("photographs")
     db = skindb.open(out / "db")
-    workflow.ingest_take(db, capture, spacing_mm=spacing)
+    workflow.ingest_take(db, folder, spacing_mm=spacing)
     report("ingest")
     held_out = FitParameters(hold_out_lights=(KEPT + 0.5) / lights)
     workflow.fit_take(db, PERSON.take, held_out)
     report("fit")
+    model = db.read("model", PERSON.take)
+    capture = db.read("capture", PERSON.take)
+    comparisons = compare_photographs(model, capture)
+    print_errors("detail", comparisons)
+    surfels = model.copy()
+    del surfels["detail"]
+    print_errors("surfels", compare_photographs(surfels, capture))
+    report("comparison")
+    write_pictures(out, model, comparisons)
+    render_head(db, out)
+    report("pictures")
+    workflow.view_takes(db, [PERSON.take], out / "viewer.html")
+    photograph_viewer(out / "viewer.html", out / "viewer.webp")
+    report("viewer")

@@ -3,7 +3,7 @@
     python docs/make_howtos.py [DB]
 
 DB is the database of `make demo`, of which a copy is used. The page of landmarks is
-drawn by Chromium. Pictures that `make_overview.py`, `make_calibration.py`,
+drawn by Chromium. Pictures that `make_atlas.py`, `make_calibration.py`,
 `skindb show` and the benchmarks wrote are reduced to 256 colours if they are large.
 """
 

@@ -33,9 +33,9 @@ from skindb.types import (
 
 # spacing of the surfels over the width of a pixel, from which on detail is estimated
 MIN_SPACING_PIXELS = 2.0
-MAX_TEXELS = (
-    1024  # along a side of the atlas; 1 kB of memory for each while views are sampled
-)
+# along a side of the atlas: a whole head at 0.3 mm; each texel takes 1 kB of memory while
+# views are sampled
+MAX_TEXELS = 1536
 MIN_COSINE = (
     0.25  # to light and camera, as farther away pixels and shadows are too wide
 )

@@ -29,7 +29,7 @@ def test_build_hero__is_a_disc_with_the_cut_of_the_neck_as_outline(head):
 
 
 def test_build_hero__no_triangle_is_turned_over(head):
-    outward = head.normals[head.faces].sum(axis=1)
+    outward = hero.normals(head.vertices)[head.faces].sum(axis=1)
     assert (dots(face_crosses(head.vertices, head.faces), outward) > 0).all()
 
 

@@ -1,8 +1,6 @@
-"""Write docs/pictures/overview.png and atlas.png from the database of `make demo`.
-
-The overview shows a photograph, its prediction, and maps of one take. The atlas picture
-shows a checkerboard of the map on the face from the front and from the side, and the
-map itself, red where the stretch exceeds 3 : 1.
+"""Write docs/pictures/atlas.png from the database of `make demo`: a checkerboard of the map
+on the face from the front and from the side, and the map itself, red where the stretch
+exceeds 3 : 1.
 """
 
 from __future__ import annotations
@@ -12,11 +10,9 @@ from pathlib import Path
 import numpy as np
 
 import skindb
-from skindb.demo.page import map_pictures
 from skindb.geometry.atlas import stretches
 from skindb.render.figures import trace_front
 from skindb.render.image import write_png
-from skindb.render.photographs import compare_photographs, side_by_side
 
 HERE = Path(__file__).parent
 TAKE = "V002"
@@ -25,27 +21,9 @@ STRETCHED = 3.0
 
 
 def main() -> None:
-    """Write both pictures; those of the overview have the same height."""
+    """Write the picture."""
     db = skindb.open(str(HERE.parent / "demo" / "db"))
-    model = db.read("model", TAKE)
-    best = min(
-        compare_photographs(model, db.read("capture", TAKE)),
-        key=lambda c: (not c.held_out, c.error["relative_rmse"]),
-    )
-    width = best.mask.shape[1]
-    rows = np.flatnonzero(best.mask.any(axis=1))
-    pair = side_by_side(best)[max(rows[0] - 8, 0) : rows[-1] + 8, : 2 * width]
-    pictures = [
-        pair[:, :width],
-        pair[:, width:],
-        *(image for image, _ in map_pictures({TAKE: model})[TAKE][:4]),
-    ]
-    atlas = atlas_picture(*_mesh(db))
-    write_png(HERE / "pictures" / "atlas.png", atlas)
-    height = 260
-    resized = [_resize(p, height) for p in pictures]
-    (HERE / "pictures").mkdir(exist_ok=True)
-    write_png(HERE / "pictures" / "overview.png", np.concatenate(resized, axis=1))
+    write_png(HERE / "pictures" / "atlas.png", atlas_picture(*_mesh(db)))
 
 
 def _mesh(db: skindb.Database) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -95,13 +73,6 @@ def _checked(
     image = image[:, : image.shape[1] // 2 * 2]
     half = image.reshape(size, 2, -1, 2, 3).mean(axis=(1, 3))
     return (half * 255).astype(np.uint8)
-
-
-def _resize(picture: np.ndarray, height: int) -> np.ndarray:
-    from skimage.transform import resize
-
-    shape = (height, round(picture.shape[1] * height / picture.shape[0]))
-    return (resize(picture, shape, anti_aliasing=True) * 255).astype(np.uint8)
 
 
 if __name__ == "__main__":
