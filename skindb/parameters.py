@@ -518,12 +518,12 @@ class SessionParameters(Limited):
     calibrated_by: str | None = option(
         None, "Name of the calibration of the dome that ingest takes from the database."
     )
-    calibration: Literal["board", "white", "ball", "dark", "flat", "chart"] | None = (
-        option(
-            None,
-            "Record this calibration target into OUT, the folder of the laboratory, in place "
-            "of a subject.",
-        )
+    calibration: (
+        Literal["board", "white", "ball", "dark", "flat", "chart", "response"] | None
+    ) = option(
+        None,
+        "Record this calibration target into OUT, the folder of the laboratory, in place "
+        "of a subject.",
     )
     sites: str = option(
         "",

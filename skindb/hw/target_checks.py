@@ -229,6 +229,7 @@ RULES: Mapping[str, Callable[[Target, Views], Iterator[Rule]]] = {
     "flat": _flat,
     "dark": _dark,
     "chart": _sharp,
+    "response": _exposed,
 }
 
 

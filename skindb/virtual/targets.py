@@ -249,7 +249,7 @@ def _reflectance(place: Float64, kind: str, number: int) -> Float64:
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         value = np.where(inside, picture[row % height, column % width], 0.5)
         return value[:, None]
-    if kind == "chart" and number == 1:
+    if kind == "response" or (kind, number) == ("chart", 1):
         centres = chart_places(CHART_PITCH)[:, :2]
         value = np.full((len(place), 3), 0.03)
         for centre, colour in zip(centres, chart_reference(), strict=True):

@@ -48,12 +48,14 @@ TEMPLATES = {
     "dark": f"{FOLDER}/dark_{{camera}}_{{repeat}}",
     "flat": f"{FOLDER}/flat_{{camera}}_{{exposure}}_{{repeat}}",
     "chart": f"{FOLDER}/chart_{{camera}}_{{exposure}}",
+    "response": f"{FOLDER}/response_{{camera}}_{{exposure}}",
 }
 CHART_WHITE = f"{FOLDER}/white_{{camera}}_{{exposure}}"
 PLACES = {"board": 12, "ball": 3, "chart": 2}
 DARK_FRAMES = 8
 FLAT_FRAMES = 2
-BRIGHTNESSES = 7  # exposures of diffuser and chart, each half of the one before
+BRIGHTNESSES = 7  # exposures of these targets, each half of the one before
+BRACKETED = ("flat", "chart", "response")
 # what the files must state of each target: file, key, keys of the target
 NEEDED = {
     "board": (boards.FILE, "", ("squares", "square", "marker")),
@@ -68,6 +70,7 @@ REQUESTS = {
     "dark": "Leave the dome empty, and darken the room",
     "flat": "Put an opal sheet before every lens",
     "chart": "Put the chart into the holder",
+    "response": "Put things with dark and bright parts into the dome, which stand still",
 }
 FIRST = {
     "board": "Put the board upright into the holder, where its middle is the origin"
@@ -199,7 +202,7 @@ def _read_laboratory(out: Path, kind: str) -> Setup:
 def _exposures(laboratory: Setup, kind: str, out: Path) -> dict[str, float]:
     """Seconds of the exposures of a recording, by id."""
     own = dict(laboratory.dome.exposures)
-    if kind not in ("flat", "chart"):
+    if kind not in BRACKETED:
         return own
     record = read_json(out / setup.FILE, []) if (out / setup.FILE).is_file() else {}
     if stated := (record or {}).get("exposures"):
@@ -250,7 +253,7 @@ def _steps(
         return [(DARK, falling[0], i + 1) for i in range(DARK_FRAMES)]
     if kind == "flat":
         return [(light, e, i + 1) for e in mixed for i in range(FLAT_FRAMES)]
-    if kind == "chart":
+    if kind in ("chart", "response"):
         return [(light, e, 1) for e in mixed]
     return [(one, e, 1) for one in laboratory.dome.light_ids for e in falling]
 
@@ -333,9 +336,10 @@ def _written(
             "flat": {"repeats": FLAT_FRAMES},
             "ball": {"places": places},
             "chart": {"white": f"{CHART_WHITE}{suffix}"},
+            "response": {},
         }
         record[kind] = record.get(kind, {}) | frames | more[kind]
-    if kind in ("flat", "chart"):
+    if kind in BRACKETED:
         record["exposures"] = [{"id": e, "seconds": s} for e, s in seconds.items()]
     write_record(file, record)
     report: Json = {"path": str(out), "kind": kind, "places": places}

@@ -73,6 +73,7 @@ def test_record_target__a_board_is_calibrated_and_continued(lab):
 def test_record_target__frames_are_in_the_layout_that_calibrate_reads(small_lab):
     lab = small_lab
     counts = {"white": 16, "ball": 16, "dark": 16, "flat": 28, "chart": 14}
+    counts["response"] = 14
     for kind, count in counts.items():
         report = record(lab, kind, **({"placements": 2} if kind == "ball" else {}))
         assert report["frames"] == count
@@ -81,7 +82,7 @@ def test_record_target__frames_are_in_the_layout_that_calibrate_reads(small_lab)
     assert list(frames.ball.outlines) == ["1", "2"]
     assert frames.kinds["dark"].repeats == 8
     assert len(frames.exposures) == 7
-    for kind in ("flat", "chart"):
+    for kind in ("flat", "chart", "response"):
         read = frames.read(frames.kinds[kind].frames, dome.cameras[0], frames.exposures)
         # each exposure is half as long
         levels = [float(np.max(one[0])) - 1024 for one in read]
@@ -150,6 +151,7 @@ FLAT_STEPS = [("l000", name, 1) for name in FLAT]
         ("dark", [("-", "e0", 1)], SECONDS),
         ("flat", FLAT_STEPS, FLAT),
         ("chart", FLAT_STEPS, FLAT),
+        ("response", FLAT_STEPS, FLAT),
     ],
 )
 def test_target_faults__none_of_good_frames(lab, tmp_path, kind, steps, seconds):
