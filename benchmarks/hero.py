@@ -84,6 +84,7 @@ SCAN_MM = 2.4
 MAX_BYTES = 150_000  # of a picture of the documentation
 EXPOSED = 1.1  # brightness of the figures
 LIGHTS_FROM = ("70,25", "10,30")  # azimuth and elevation [degrees]
+DARK = 8  # of 255: background
 VIEWER_MS = 8000  # until the page has drawn its final picture
 KEPT = 4  # photographs that ingest keeps
 HAIR_COLOUR = np.array([0.040, 0.029, 0.022])
@@ -729,6 +730,8 @@ def render_head(db: skindb.Database, out: Path) -> None:
         options |= {"size": 450, "exposure": "auto", "subsurface": True}
         workflow.render_take(db, path, PERSON.take, **options)
         pictures.append(np.asarray(Image.open(path).convert("RGB")))
+    part = shown_part([picture.max(axis=2) > DARK for picture in pictures], 12)
+    pictures = [picture[part] for picture in pictures]
     save(out / "render.webp", np.concatenate(pictures, axis=1), 900)
 
 
