@@ -55,18 +55,15 @@ MEASURED = (  # differences from skindb render (docs/howto/view.md)
     ),
 )
 KEPT = (  # measured by benchmarks/omissions.py on a face of 23,393 surfels
-    (
-        "not skipped: surfels, because each is visible from some direction; the page "
-        "has no other texels of the face"
-    ),
+    ("not skipped: surfels, because each is visible from some direction"),
     (
         "not skipped: texels of the BRDF tables, because bases with half of them along "
         "an axis differ by 0.2 to 8 %"
     ),
     "not skipped: lights of the surroundings, because none is below the horizon of all surfels",
 )
-DETAIL = "skipped: the detail of texels, which pictures and exports show"
-KINDS = {"float16": "f2", "float32": "f4", "uint32": "u4"}
+DETAIL = "approximated: the detail of texels in steps of 0.8 %"
+KINDS = {"float16": "f2", "float32": "f4", "uint32": "u4", "uint8": "u1"}
 
 
 @dataclass(frozen=True)
@@ -197,6 +194,11 @@ def face_record(
         "tableA": tables[0],
         **({"tableB": tables[1]} if len(tables) > 1 else {}),
     }
+    if surface.detail is not None:
+        # rows of the albedo, then of the normal; bytes of -1 to 1
+        changes = np.concatenate(np.split(surface.detail, 2, axis=2))
+        steps = np.clip(np.round(127 * changes), -127, 127) + 128
+        arrays["detail"] = steps.astype(np.uint8)
     about = _about(model, surface, take, attributes, resampled.shape)
     about["surroundings"] = _surroundings(environment, about["exposure"])
     about["photographs"] = [] if capture is None else photograph_records(model, capture)

@@ -63,6 +63,18 @@ function halfTexture(gl, width, height, type, values) {
   return texture;
 }
 
+// bytes (2 n, n, 3) with smaller copies for a face that is far away
+function detailTexture(gl, bytes) {
+  const texture = gl.createTexture(), width = Math.sqrt(bytes.length / 6);
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+  gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB8, width, 2 * width, 0, gl.RGB, gl.UNSIGNED_BYTE, bytes);
+  gl.pixelStorei(gl.UNPACK_ALIGNMENT, 4);
+  gl.generateMipmap(gl.TEXTURE_2D);
+  for (const axis of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, axis, gl.CLAMP_TO_EDGE);
+  return texture;
+}
+
 function target(gl, size) {
   const texture = halfTexture(gl, size, size, gl.HALF_FLOAT, null);
   const frame = gl.createFramebuffer();

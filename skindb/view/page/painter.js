@@ -29,7 +29,7 @@ class Painter {
     this.glows = {};
     this.empty = gl.createVertexArray();
     this.sides = {};
-    this.sum = this.sums = this.tableA = this.tableB = this.lobes = this.mirror = null;
+    this.sum = this.sums = this.tableA = this.tableB = this.lobes = this.mirror = this.detail = null;
   }
 
   load(face) {
@@ -44,11 +44,12 @@ class Painter {
     }
     this.face = face;
     this.visible = new VisibleTriangles(face);
-    for (const name of ["tableA", "tableB", "lobes"]) if (this[name]) gl.deleteTexture(this[name]);
+    for (const name of ["tableA", "tableB", "lobes", "detail"]) if (this[name]) gl.deleteTexture(this[name]);
     this.ambient = buffer(gl, 9, 4, gl.FLOAT, new Float32Array((4 * face.position.length) / 3));
     this.sides = Object.fromEntries(names.map((name) => [name, this.side(face)]));
     this.tableA = table3d(gl, face.tableShape, face.tableA);
     this.tableB = face.tableB ? table3d(gl, face.tableShape, face.tableB) : this.tableA;
+    this.detail = face.detail ? detailTexture(gl, face.detail) : null;
     this.lobes = halfTexture(gl, face.tableLobes.length / 8, 2, gl.HALF_FLOAT, face.tableLobes);
   }
 
@@ -305,11 +306,12 @@ class Painter {
     this.bindTextures([
       [gl.TEXTURE_2D_ARRAY, this.shadow.texture], [gl.TEXTURE_3D, this.tableA], [gl.TEXTURE_3D, this.tableB],
       [gl.TEXTURE_2D, glow], [gl.TEXTURE_2D, this.mirror], [gl.TEXTURE_2D, this.lobes],
+      [gl.TEXTURE_2D, this.detail],
     ]);
     const program = state.component ? "components" : face.tableB ? "faceOfMany" : "face";
     setUniforms(gl, this.programs[program], {
       ...uniforms, matrix: ["mat4", matrix], eye: ["3fv", eye], exposure: ["1f", state.exposure * face.exposure],
-      tableA: ["1i", 1], tableB: ["1i", 2], glow: ["1i", 3], mirror: ["1i", 4], lobes: ["1i", 5],
+      tableA: ["1i", 1], tableB: ["1i", 2], glow: ["1i", 3], mirror: ["1i", 4], lobes: ["1i", 5], detail: ["1i", 6], withDetail: ["1i", face.detail ? 1 : 0],
       withDiffuse: ["1i", state.withDiffuse ? 1 : 0], withSurface: ["1i", state.withSurface ? 1 : 0],
       withGlow: ["1i", glow ? 1 : 0], withMirror: ["1i", mirror ? 1 : 0],
       linear: ["1i", sums ? 1 : 0], toned: ["1i", state.toned ? 1 : 0], component: ["1i", state.component],

@@ -40,6 +40,18 @@ float lit(int i, vec3 position, vec3 normal) {
 }
 `;
 
+// changes of albedo (below in the texture) and normal (above) that are finer than the surfels
+const DETAIL = `
+uniform bool withDetail;
+uniform sampler2D detail;
+in vec2 vUv;
+vec3 finer(float side) {
+  return withDetail ? (texture(detail, vec2(vUv.x, 0.5 * (vUv.y + side))).rgb * 255.0 - 128.0) / 127.0 : vec3(0.0);
+}
+vec3 finerAlbedo(vec3 albedo) { return albedo * (1.0 + finer(0.0)); }
+vec3 finerNormal(vec3 normal) { return normalize(normal + finer(1.0)); }
+`;
+
 const ENCODE = `
 uniform bool toned;
 vec3 encode(vec3 x) {
@@ -149,11 +161,13 @@ layout(location = 0) in vec3 position;
 layout(location = 1) in vec3 normal;
 layout(location = 2) in vec3 albedo;
 layout(location = 5) in vec3 diffusion;
+layout(location = 6) in vec2 uv;
 layout(location = 8) in vec2 quality;
 uniform mat4 matrix;
 uniform highp int component;
-out vec3 vShown;
+out vec3 vShown; out vec2 vUv;
 void main() {
+  vUv = uv;
   vShown = component == 1 ? normal : component == 2 ? diffusion / 3.0 : component == 5 ? albedo : vec3(quality, 0.0);
   gl_Position = matrix * vec4(position, 1.0);
 }`,
@@ -162,6 +176,7 @@ precision highp float;
 uniform highp int component;  // 1 normals, 2 translucency, 3 status, 4 error of the albedo, 5 albedo
 in vec3 vShown;
 out vec4 result;
+${DETAIL}
 ${ENCODE}
 vec3 scale(float x) {  // dark blue to yellow, monotone in lightness
   x = clamp(x, 0.0, 1.0);
@@ -169,10 +184,10 @@ vec3 scale(float x) {  // dark blue to yellow, monotone in lightness
 }
 void main() {
   vec3 doubtful = vShown.x > 0.25 ? vec3(0.9, 0.7, 0.2) : vec3(0.75, 0.25, 0.2);
-  if (component == 1) result = vec4(0.5 * normalize(vShown) + 0.5, 1.0);
+  if (component == 1) result = vec4(0.5 * finerNormal(vShown) + 0.5, 1.0);
   else if (component == 3) result = vec4(vShown.x > 0.75 ? vec3(0.2, 0.6, 0.3) : doubtful, 1.0);
   else if (component == 4) result = vec4(scale(vShown.y / 0.3), 1.0);
-  else result = vec4(encode(vShown), 1.0);
+  else result = vec4(encode(component == 5 ? finerAlbedo(vShown) : vShown), 1.0);
 }`,
   },
 
@@ -209,7 +224,7 @@ uniform sampler2D mirror;
 uniform sampler2D lobes;  // directional albedo of the bases
 uniform bool linear;  // whether to output radiance, to be summed, instead of a display colour
 const float MIN_COSINE = 0.03;
-in vec3 vPosition; in vec3 vNormal; in vec3 vAlbedo; in vec4 vWeightA; in vec2 vUv; in vec4 vAmbient;
+in vec3 vPosition; in vec3 vNormal; in vec3 vAlbedo; in vec4 vWeightA; in vec4 vAmbient;
 #ifdef SECOND_TABLE
 in vec4 vWeightB;
 #endif
@@ -229,9 +244,10 @@ vec3 place(vec3 n, vec3 wi, vec3 wo) {
   return vec3((clamp(at, 0.0, 1.0) * (size.xy - 1.0) + 0.5) / size.xy, phi / PI + 0.5 / size.z);
 }
 
+${DETAIL}
 ${ENCODE}
 void main() {
-  vec3 n = normalize(vNormal);
+  vec3 n = finerNormal(vNormal);
   vec3 wo = normalize(eye - vPosition), matte = vec3(0.0), gloss = vec3(0.0);
   float cosO = dot(n, wo);
   if (cosO < MIN_COSINE) n = normalize(n + (MIN_COSINE - cosO) * wo);  // no black line where shading normals turn away
@@ -265,7 +281,7 @@ void main() {
 #endif
     gloss += texture(mirror, vec2(atan(way.x, way.z) / (2.0 * PI) + 0.5, acos(clamp(way.y, -1.0, 1.0)) / PI)).rgb * (albedo * vAmbient.a);
   }
-  vec3 radiance = (withDiffuse ? matte * vAlbedo : vec3(0.0)) + gloss;
+  vec3 radiance = (withDiffuse ? matte * finerAlbedo(vAlbedo) : vec3(0.0)) + gloss;
   result = vec4(linear ? radiance * exposure : shown(radiance * exposure), 1.0);
 }`,
   },
