@@ -1,5 +1,5 @@
 """Measured BRDFs outside the dictionary, fitted with its 59 materials and with reduced
-bases (docs/validation.md).
+bases (docs/results).
 
     python -m benchmarks targets PATH... [--only WORD...] [--surfels N] [--noise FRACTION]
 

@@ -1,5 +1,5 @@
 """Errors of fits of captures made by an independent renderer, relative to their truth
-(docs/validation.md).
+(docs/results).
 
     python -m benchmarks validate DB CAPTURE [CAPTURE...]
 

@@ -32,7 +32,7 @@ SIZE = 512  # texels along each side of the stored maps of a registration
 # degrees between the normal and a half vector, within which a surfel must be seen for its
 # surface reflectance to count: without the peak of its lobe it is a third too low, by an
 # amount that depends on the shape of the face. Chosen on ten virtual subjects of 4 cameras
-# and 24 lights, the patches after another dome was seen; docs/validation.md has a third
+# and 24 lights, the patches after another dome was seen; docs/results has a third
 MAX_HALF_ANGLE = 12.0
 # mm; errors of surface reflectance are independent between patches of this size only
 PATCH_SIZE = 20.0

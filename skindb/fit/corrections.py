@@ -35,7 +35,7 @@ SMALLEST_SHADING = 0.2
 # weight of the prior that gains are 1, relative to the information of the views on the
 # median light. Chosen on three captures of measured materials; on these and on two with
 # other surfaces, with errors of the lights of 0 to 15 %, errors of 0.2 to 2.5 % remain
-# (docs/validation.md).
+# (docs/results).
 PRIOR = 0.03
 # the same of the prior that a light is where it is stated, per rad^2: 0.3 to 1 predict eight
 # faces under strobes within 0.05 points; 0.03 is worse by 0.2, and 2 by 0.15

@@ -39,7 +39,7 @@ MAX_DEVIATIONS = 1.0
 PROPORTIONAL_ERROR = 0.02
 # Fraction of what the highlights lack that R_d contains: the nearly even lobes of the joint
 # fit take the rest. 0.4 to 0.9 in blue in four captures. On 24 others
-# the mean bias of R_d in blue is 0 with it, and 3 % without (docs/validation.md).
+# the mean bias of R_d in blue is 0 with it, and 3 % without (docs/results).
 JOINT_FRACTION = 0.5
 SMALLEST_ERROR = 1e-9  # of a prior that is stated to be exact
 # error of what highlights do not show without a prior of the total: highlights of bare

@@ -46,7 +46,7 @@ from skindb.types import Array, IntVector, Mask, finite_rows, lengths
 
 # Strength of the lobe over the median R_d. The first was chosen on four faces of Extended
 # Yale B; of five up to it, it is also the best for the four others and, at this width, for
-# the cat of DiLiGenT (docs/validation.md). Under few lights held-out samples tell
+# the cat of DiLiGenT (docs/results). Under few lights held-out samples tell
 # little: another strength must predict them better by `MIN_GAIN`, as for a matt surface or a
 # smooth one above an ideal matt body (planted skin: by 0.16 to 0.6).
 STRENGTHS = (16.0, 4.0, 1.0, 0.25)

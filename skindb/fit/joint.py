@@ -38,7 +38,7 @@ from skindb.types import Array, dots
 # Factors of the errors by device and by samples, and an angle [degree], of which the total
 # error of a normal consists. Chosen on six captures with known truth, where 93 to 99 % of
 # the angles were below 1.73 times it with a whole step of the normal; not chosen on the
-# cat of DiLiGenT, where 88 % are (docs/validation.md). The factor of the errors by samples is
+# cat of DiLiGenT, where 88 % are (docs/results). The factor of the errors by samples is
 # the root of their number up to this one: errors of the model do not fall with it. Chosen
 # on the cat under 4 to 48 lights; the faces confirm it.
 TOTAL_SHARED = 2.0

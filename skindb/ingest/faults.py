@@ -34,7 +34,7 @@ SAMPLE_CURE = (
 )
 # Heads in domes with common errors (lights 1 mm, cameras 0.03 degrees, hair, motion)
 # have offsets of up to 1.4 mm, scales of 1.5 %, agreements of 0.93 and more, a scan
-# within 0.8 mm and 0.2 degrees: see docs/validation.md
+# within 0.8 mm and 0.2 degrees: see docs/results
 DOUBTFUL_OFFSET_MM = 2.5
 DOUBTFUL_AGREEMENT = 0.8
 # relative: a wrong distance, focal length or unit

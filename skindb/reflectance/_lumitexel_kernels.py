@@ -63,7 +63,7 @@ MIN_SAMPLES_GLOSS = 4
 MIN_SAMPLES_LOBES = 12
 
 # relative error of a model in held-out samples without noise, 2 to 6 %
-# (docs/validation.md), with which the noise of a sample is compared
+# (docs/results), with which the noise of a sample is compared
 MODEL_ERROR = 0.05
 # to light or camera; below it lights are partly hidden, and pixels cover a large area
 MIN_COSINE_SURFACE = 0.1

@@ -41,7 +41,7 @@ MAX_SCAN_ERROR = np.radians(15.0)
 # with known truth, medians are 0.5 to 0.8 degrees (imperfect capture 1.7), best or within
 # 0.07 of the better one of both, and a second step changed them by 0.002 degrees. Without
 # a scan more steps improve normals and predictions of the cat of DiLiGenT and of eight
-# faces (docs/validation.md).
+# faces (docs/results).
 STEPS = (1, 0.7)
 STEPS_WITHOUT_SCAN = (4, 1.0)
 

@@ -20,7 +20,7 @@ ANGLES = ("theta_h", "theta_d", "phi_d")
 WIDTH_DIFFERENCE = np.radians(20)  # theta_d at which widths of lobes are measured
 # theta_h up to which light belongs to the narrow of two lobes. Of seven angles from 6 to 25
 # degrees the one at which glossiness of regions differs least from the truth over 70 virtual
-# subjects; docs/validation.md has 13 others
+# subjects; docs/results has 13 others
 NARROW_ANGLE = np.radians(20)
 
 

@@ -187,7 +187,7 @@ def evaluate_error(
       surface term and that at this angle, which the model extrapolates.
 
     Held-out samples with known truth are within 1.96 times this error at the rates in
-    docs/validation.md.
+    docs/results.
 
     Parameters
     ----------

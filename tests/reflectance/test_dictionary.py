@@ -391,7 +391,7 @@ def test_dictionary_quality__albedo_by_scipy(embedded, name):
 
 
 def test_dictionary_quality__the_embedded_materials(embedded):
-    """The figures of docs/validation.md, with a tolerance for another sample of directions."""
+    """The figures of docs/results, with a tolerance for another sample of directions."""
     assert embedded["energy_excess"].max() == 0
     assert embedded["reciprocity_error"].max() < 1e-12
     assert np.median(embedded["interpolation_error"]) < 0.01
