@@ -45,7 +45,7 @@ def main(folder: Path) -> None:
 
 
 def _receive(folder: Path) -> None:
-    features = "PixelFormat=Mono16 Width=2048 Height=2048 TriggerMode=Off"
+    features = "PixelFormat=BayerRG8 Width=2048 Height=2048 TriggerMode=Off"
     with subprocess.Popen([FAKE, "-i", ADDRESS], stdout=subprocess.DEVNULL) as camera:
         while subprocess.run(
             [PYTHON, "-c", ANSWERS], stderr=subprocess.DEVNULL, check=False
@@ -64,8 +64,6 @@ def _receive(folder: Path) -> None:
         camera.terminate()
     frames = json.loads(said.splitlines()[1])["frames"]
     core = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    print(
-        f"receiving and writing: {frames * 2 * 2048**2 / 1e6 / core:.0f} MB/s of a core"
-    )
+    print(f"receiving and writing: {frames * 2048**2 / 1e6 / core:.0f} MB/s of a core")
     for file in folder.glob("*.tif"):
         file.unlink()

@@ -24,7 +24,7 @@ BUFFER_BYTES = 1 << 28  # of the frames of a camera that wait for the disk
 WAIT_US = 50_000
 # 16-bit numbers of GigE Vision 1 go from 65535 to 1, later ones have 64 bits
 WRAP = 65535
-GREY, CFA = 1, 32803  # photometric interpretations of TIFF
+CFA = 32803  # photometric interpretation of TIFF
 COLOURS = {"R": 0, "G": 1, "B": 2}
 LOSSES = ("incomplete", "n_underruns", "n_missing_frames", "n_missing_packets")
 PATTERNS = {"RG": "RGGB", "GR": "GRBG", "GB": "GBRG", "BG": "BGGR"}
@@ -37,34 +37,31 @@ def tiff_head(width: int, height: int, pixel_format: str) -> bytes:
     Raises
     ------
     ValueError
-        For formats other than Mono and Bayer with 8 to 16 bits in 1 or 2 bytes.
+        For formats other than Bayer with 8 to 16 bits in 1 or 2 bytes.
     """
-    match = re.fullmatch(r"(?:Mono|Bayer(RG|GR|GB|BG))(8|10|12|14|16)", pixel_format)
+    match = re.fullmatch(r"Bayer(RG|GR|GB|BG)(8|10|12|14|16)", pixel_format)
     if match is None:
         raise ValueError(
-            f"PixelFormat {pixel_format} is not Mono or Bayer with 8, 10, 12, 14 or 16 "
-            "bits; set another one, such as BayerRG12"
+            f"PixelFormat {pixel_format} is not Bayer with 8, 10, 12, 14 or 16 bits; "
+            "set another one, such as BayerRG12"
         )
     pattern, bits = match.groups()
     size = 1 if bits == "8" else 2
+    colours = bytes(COLOURS[colour] for colour in PATTERNS[pattern])
     tags = [
         (256, 4, 1, width),
         (257, 4, 1, height),
         (258, 3, 1, 8 * size),
         (259, 3, 1, 1),
-        (262, 3, 1, CFA if pattern else GREY),
+        (262, 3, 1, CFA),
         (273, 4, 1, 0),
         (277, 3, 1, 1),
         (278, 4, 1, height),
         (279, 4, 1, width * height * size),
         (281, 3, 1, 2 ** int(bits) - 1),
+        (33421, 3, 2, 2 | 2 << 16),
+        (33422, 1, 4, *struct.unpack("<I", colours)),
     ]
-    if pattern:
-        colours = bytes(COLOURS[colour] for colour in PATTERNS[pattern])
-        tags += [
-            (33421, 3, 2, 2 | 2 << 16),
-            (33422, 1, 4, *struct.unpack("<I", colours)),
-        ]
     begin = 8 + 2 + 12 * len(tags) + 4
     tags[5] = (273, 4, 1, begin)
     entries = b"".join(struct.pack("<HHII", *tag) for tag in tags)
@@ -149,4 +146,4 @@ if __name__ == "__main__":
     except Exception as error:
         # errors of Aravis have the text without their domain
         say(str(getattr(error, "message", error) or type(error)).splitlines()[0])
-        raise
+        raise SystemExit(1) from error

@@ -17,7 +17,7 @@ import numpy as np
 
 from skindb.calibration import boards, setup
 from skindb.clock import SimulatedClock
-from skindb.errors import Fault, require_none
+from skindb.errors import Fault, require, require_none
 from skindb.files import Json, private_umask
 from skindb.format.fields import read_json
 from skindb.format.frames import filled
@@ -52,6 +52,7 @@ TEMPLATES = {
 }
 CHART_WHITE = f"{FOLDER}/white_{{camera}}_{{exposure}}"
 PLACES = {"board": 12, "ball": 3, "chart": 2}
+MIN_PLACES = {"board": boards.MIN_POSES, "ball": 2}  # that calibrate needs
 DARK_FRAMES = 8
 FLAT_FRAMES = 2
 BRIGHTNESSES = 7  # exposures of these targets, each half of the one before
@@ -131,6 +132,9 @@ def record_target(
         places = parameters.placements or PLACES.get(kind, 1)
         if kind == "chart":
             places = PLACES[kind]
+        fewest = MIN_PLACES.get(kind, 1)
+        rule = f"must be at least {fewest} for a {kind}"
+        require(places >= fewest, "--placements", rule, f"{places}", "record more")
         notes = list[str]()
         board = read_json(out / boards.FILE, []) if kind == "board" else {}
         for number in range(1, places + 1):

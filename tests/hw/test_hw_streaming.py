@@ -119,7 +119,7 @@ def test_streaming_cameras__each_trigger_gives_its_frame(
 
 
 def test_streaming_cameras__a_run_without_triggers_keeps_every_frame(camera, tmp_path):
-    cameras = _streams(tmp_path, f"PixelFormat=Mono8 {SIZE} TriggerMode=Off")
+    cameras = _streams(tmp_path, f"PixelFormat=BayerRG8 {SIZE} TriggerMode=Off")
     try:
         cameras.start()
         shots = cameras.collect(30)["c0"]
@@ -129,7 +129,7 @@ def test_streaming_cameras__a_run_without_triggers_keeps_every_frame(camera, tmp
     numbers = [int(re.search(r"_(\d+)\.tif", path.name)[1]) for path in files]
     assert numbers == sorted(set(numbers))
     assert len(files) >= len(shots) >= 30
-    head = len(tiff_head(WIDTH, HEIGHT, "Mono8"))
+    head = len(tiff_head(WIDTH, HEIGHT, "BayerRG8"))
     assert {path.stat().st_size for path in files} == {head + WIDTH * HEIGHT}
 
 
@@ -137,16 +137,18 @@ def test_streaming_cameras__a_run_without_triggers_keeps_every_frame(camera, tmp
     ("features", "device", "said"),
     [
         ("Gian=3", ADDRESS, r"camera c0: must stream; found \[Gian\] Not found; cor"),
-        ("PixelFormat=RGB8", ADDRESS, "PixelFormat RGB8 is not Mono or Bayer"),
+        ("PixelFormat=RGB8", ADDRESS, "PixelFormat RGB8 is not Bayer with 8"),
+        ("PixelFormat=Mono8", ADDRESS, "PixelFormat Mono8 is not Bayer with 8"),
         (SIZE, "127.0.0.77", "camera c0: must stream; found .*127.0.0.77"),
         ("", "", "must be text, and not empty; .*see docs/howto/capture.md"),
     ],
 )
 def test_streaming_cameras__a_wrong_setting_is_one_line(
-    camera, tmp_path, features, device, said
+    camera, tmp_path, features, device, said, capfd
 ):
     with pytest.raises(InputError, match=said):
         _streams(tmp_path, features, device)
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize(
@@ -164,7 +166,7 @@ def test_streaming_cameras__say_what_to_install(tmp_path, monkeypatch, python, s
 
 @pytest.mark.parametrize("camera", [300], indirect=True)  # of 1,000 packets
 def test_streaming_cameras__lost_packets_are_said(camera, tmp_path):
-    cameras = _streams(tmp_path, f"PixelFormat=Mono8 {SIZE} {TRIGGERED}")
+    cameras = _streams(tmp_path, f"PixelFormat=BayerRG8 {SIZE} {TRIGGERED}")
     try:
         cameras.start()
         cameras._quiet = 1.0
@@ -174,12 +176,12 @@ def test_streaming_cameras__lost_packets_are_said(camera, tmp_path):
     finally:
         cameras.close()
     # only complete ones are kept
-    head = len(tiff_head(WIDTH, HEIGHT, "Mono8"))
+    head = len(tiff_head(WIDTH, HEIGHT, "BayerRG8"))
     assert all(shot.path.stat().st_size == head + WIDTH * HEIGHT for shot in shots)
 
 
 def test_streaming_cameras__lines_that_come_together_are_all_answered(camera, tmp_path):
-    cameras = _streams(tmp_path, f"PixelFormat=Mono8 {SIZE} {TRIGGERED}")
+    cameras = _streams(tmp_path, f"PixelFormat=BayerRG8 {SIZE} {TRIGGERED}")
     try:
         cameras.start()
         cameras._tell("trigger\ntrigger")
@@ -192,7 +194,7 @@ def test_streaming_cameras__lines_that_come_together_are_all_answered(camera, tm
 
 
 def test_streaming_cameras__a_camera_that_vanished_is_named(camera, tmp_path):
-    cameras = _streams(tmp_path, f"PixelFormat=Mono8 {SIZE} {TRIGGERED}")
+    cameras = _streams(tmp_path, f"PixelFormat=BayerRG8 {SIZE} {TRIGGERED}")
     cameras.start()
     cameras._processes["c0"].kill()
     cameras._quiet = 0.1

@@ -97,6 +97,7 @@ def test_record_target__frames_are_in_the_layout_that_calibrate_reads(small_lab)
     [
         ("board", {"subject": "S1"}, "--subject: belongs to the capture of a subject"),
         ("ball", {}, "must describe the ball by radius; found no radius"),
+        ("board", {"placements": 3}, "--placements: must be at least 4 for a board"),
         ("dark", {"faults": ("dropped_frame=c09:1",)}, "those of the set-up"),
         (
             "white",
