@@ -16,7 +16,14 @@ from typing import Any
 import numpy as np
 
 from skindb.calibration.setup import PROBE_FILE, read_setup_dome
-from skindb.errors import Fault, InputError, input_error, require, require_none
+from skindb.errors import (
+    Fault,
+    InputError,
+    add_filename,
+    input_error,
+    require,
+    require_none,
+)
 from skindb.files import make_private, private_file
 from skindb.format.dome import CameraRecord, DomeRecord
 from skindb.format.fields import Fields, read_json
@@ -501,13 +508,28 @@ def _write_probe(session: Unfinished, probe: Mapping[str, Any]) -> None:
     write_record(session.folder / "contact/probe.json", record)
 
 
+@contextmanager
+def _complete(path: Path) -> Iterator[Path]:
+    """A file beside this path, which takes its place when it is complete, so that a full disc
+    or an interruption neither leaves a part nor harms the file before.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}")
+    with add_filename(str(path)):
+        try:
+            yield part
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+
+
 def copy_frame(path: Path, target: Path) -> None:
     """Copy a file, and make the folder of the copy."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(path, target)
+    with _complete(target) as part:
+        part.write_bytes(path.read_bytes())
 
 
 def write_record(path: Path, record: Mapping[str, Any]) -> None:
     """Write a JSON file, and make its folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(record, indent=1), encoding="utf-8")
+    with _complete(path) as part:
+        part.write_text(json.dumps(record, indent=1), encoding="utf-8")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 from itertools import product
 
 import numpy as np
@@ -19,6 +20,7 @@ from skindb.calibration.setup import (
 )
 from skindb.errors import InputError
 from skindb.format.frames import read_frame, write_frame
+from skindb.hw.capture_folder import copy_frame, write_record
 from skindb.hw.target_checks import Target, target_faults
 from skindb.parameters import SessionParameters
 from skindb.types import unit
@@ -110,6 +112,29 @@ def test_record_target__faults_are_one_line(small_lab, kind, options, said):
     (small_lab / "dome/calibration.json").write_text("{}")
     with pytest.raises(InputError, match=said):
         record(small_lab, kind, **options)
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda file: write_record(file, {"text": "x" * 2000}),
+        lambda file: copy_frame(file.with_name("long.png"), file),
+    ],
+)
+def test_record_target__a_file_that_finds_no_space_stays_as_before(tmp_path, write):
+    file = tmp_path / "dome.json"
+    file.write_text("before")
+    (tmp_path / "long.png").write_bytes(bytes(2000))
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        with pytest.raises(OSError, match="File too large") as error:
+            write(file)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert error.value.filename == str(file)
+    assert file.read_text() == "before"
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_record_target__lost_frames_are_taken_again(small_lab):
