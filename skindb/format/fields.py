@@ -47,7 +47,8 @@ class TextRule(NamedTuple):
 NON_EMPTY = TextRule(r"(?s).+", "must be text, and not empty")
 NAME = TextRule(r"[A-Za-z0-9_-]{1,64}", "must be 1 to 64 letters, digits, '-' or '_'")
 IDENTIFIER = TextRule(
-    r"[A-Za-z0-9_.-]{1,64}", "must be 1 to 64 letters, digits, '-', '_' or '.'"
+    r"(?!\.)[A-Za-z0-9_.-]{1,64}",  # "." and ".." are folders
+    "must be 1 to 64 letters, digits, '-', '_' or '.', which is not the first",
 )
 
 

@@ -250,6 +250,10 @@ FAULTS = {
         put(D, "cameras", 1, "id", value="c0"),
         r"\[cameras\]: ids must differ; found c0",
     ),
+    "a camera named as a folder": (
+        put(D, "cameras", 1, "id", value=".."),
+        r"\[cameras\]\[1\]\[id\]: must be 1 to 64 letters",
+    ),
     "duplicate light": (
         put(D, "lights", 1, "id", value="l0"),
         r"\[lights\]: ids must differ; found l0",
