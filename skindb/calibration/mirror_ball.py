@@ -46,6 +46,7 @@ MAX_SIZE_MISMATCH = 0.05
 ROUNDS = 20
 # from which the places of a ball are found; each has six unknowns
 MAX_PLACE_LIGHTS = 24
+MAX_PLACE_STEPS = 60  # of a fit; balls of a wrong size move away without an end
 # radii: from highlights on the front to those of its edge
 BEHIND = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 # rad, misses from which a ray counts less: at first, and at the end
@@ -282,18 +283,23 @@ def ball_places(
     back = np.array([unit(centre - eyes).mean(axis=0) for centre in front])
     starts = [(front + part * radius * back).ravel() for part in BEHIND]
     best = min(starts, key=lambda x: float(np.abs(misses(x)).sum()))
+    converged = True
     for outlier in OUTLIERS:
-        fit = least_squares(misses, best, loss="soft_l1", f_scale=outlier)
+        fit = least_squares(
+            misses, best, loss="soft_l1", f_scale=outlier, max_nfev=MAX_PLACE_STEPS
+        )
         best = fit.x
+        converged &= fit.success
     miss = np.degrees(np.median(lengths(fit.fun.reshape(-1, 3))))
     # balls of a wrong size fit best far away, where all lines are parallel
     away = lengths(fit.x.reshape(-1, 3) - front).max()
     require(
-        miss <= MAX_MISS_DEGREES and away <= 2 * radius,
+        converged and miss <= MAX_MISS_DEGREES and away <= 2 * radius,
         "mirror ball",
         f"its highlights must agree with a ball of radius {radius:g} mm within "
         f"{MAX_MISS_DEGREES:g} degrees",
-        f"{miss:.1f} degrees, {away:.0f} mm from where the lines to them meet",
+        f"{miss:.1f} degrees, {away:.0f} mm from where the lines to them meet"
+        f"{'' if converged else ', and still moving'}",
         "give the radius of the ball in mm, and remove other bright things from the pictures",
     )
     return dict(zip(start, fit.x.reshape(-1, 3), strict=True))
