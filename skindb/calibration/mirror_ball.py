@@ -1,6 +1,5 @@
 """Positions of lights from their highlights on a mirror ball."""
 
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -18,7 +17,6 @@ from skindb.errors import (
     InputError,
     attempt,
     attempt_all,
-    few_names,
     require,
 )
 from skindb.format.dome import (
@@ -46,13 +44,15 @@ MAX_SIZE_MISMATCH = 0.05
 ROUNDS = 20
 # from which the places of a ball are found; each has six unknowns
 MAX_PLACE_LIGHTS = 24
-MAX_PLACE_STEPS = 60  # of a fit; balls of a wrong size move away without an end
+MAX_PLACE_STEPS = 60  # of a fit; random domes with the right radius needed at most 48
 # radii: from highlights on the front to those of its edge
 BEHIND = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
-# rad, misses from which a ray counts less: at first, and at the end
-OUTLIERS = (0.3, 0.01)
-# median of the highlights: a pixel on a ball with a radius of 100 px turns a ray by 1.1 degrees
-MAX_MISS_DEGREES = 2.0
+# losses, and misses [rad] of lines of sight from which they count less; a pixel is 0.3 to 3 mrad
+OUTLIERS = (("soft_l1", 2e-3), ("soft_l1", 3e-4), ("cauchy", 3e-4))
+MAX_MISS = 0.2  # of the radius
+# each reduces the error by the radius over the distance of eye and light
+SIGHT_STEPS = 6
+FAR_MM = 1000.0
 THREADS = 2
 
 # place, camera -> column and row, px
@@ -221,88 +221,103 @@ def _mirrored(
     return point, out, under
 
 
+def _sights(eye: Float64, ball: Float64, radius: float, light: Float64) -> Float64:
+    """Unit directions (..., 3) in which eyes (..., 3) see the highlights of lights (..., 3) on
+    balls (..., 3).
+    """
+    point = ball
+    for _ in range(SIGHT_STEPS):
+        # the normal halves the angle between eye and light
+        point = ball + radius * unit(unit(eye - point) + unit(light - point))
+    return unit(point - eye)
+
+
 def ball_places(
     cameras: Mapping[str, Pinhole], highlights: Sequence[Highlights], radius: float
 ) -> dict[str, Float64]:
     """Centres (3,) mm of a ball of known radius at several places, from the highlights of
-    many lights: those for which the mirrored lines of sight of each light meet best.
+    many lights: bundle adjustment of the centres and the lights. The radius is estimated as
+    well, and compared with the known one.
 
     Raises
     ------
     InputError
-        If fewer than two cameras see the highlights at a place, or the lines do not meet.
+        If fewer than two cameras see the highlights at a place, or the highlights are not those of
+        a ball of this radius.
     """
     seen = [one for one in highlights if len(one) > 2]
     seen = seen[:: -(-len(seen) // MAX_PLACE_LIGHTS) or 1]
-    start = dict[str, Float64]()
-    for place in sorted({place for one in seen for place, _ in one}):
-        views = defaultdict[str, list[Float64]](list)
-        for one in seen:
-            for (at, camera), pixel in one.items():
-                if at == place:
-                    views[camera].append(pixel)
+    places = sorted({place for one in seen for place, _ in one})
+    if not places:
+        return {}
+    rows = [
+        (places.index(place), i, cameras[name].centre, cameras[name].rays(pixel))
+        for i, one in enumerate(seen)
+        for (place, name), pixel in one.items()
+    ]
+    at, of, eye, view = map(np.array, zip(*rows, strict=True))
+    front = np.empty((len(places), 3))
+    for k, place in enumerate(places):
+        eyes, which = np.unique(eye[at == k], axis=0, return_inverse=True)
         require(
-            len(views) > 1,
+            len(eyes) > 1,
             f"mirror ball, place {place}",
             "two cameras must see its highlights",
-            few_names(list(views)),
+            f"{len(eyes)}",
             "move the ball to the middle of the dome, or give its outlines",
         )
-        start[place] = light_position(
-            [cameras[camera].centre for camera in views],
-            [cameras[c].rays(np.median(p, axis=0)) for c, p in views.items()],
-        ).position
-    index = {place: i for i, place in enumerate(start)}
-    # eyes, lines of sight, and indices of the place
-    rays = [
-        (
-            np.array([cameras[camera].centre for _, camera in one]),
-            np.array([cameras[camera].rays(one[p, camera]) for p, camera in one]),
-            [index[place] for place, _ in one],
-        )
-        for one in seen
-    ]
+        lines = [np.median(view[at == k][which == j], axis=0) for j in range(len(eyes))]
+        front[k] = light_position(eyes, unit(np.array(lines))).position
+    count = front.size
 
-    def misses(x: Float64) -> Float64:
-        centres = x.reshape(-1, 3)
-        apart = []
-        for eye, view, places in rays:
-            point, out, _ = _mirrored(eye, view, centres[places], radius)
-            try:
-                light = light_position(point, out).position
-            except InputError:  # they are parallel far from the solution
-                light = point - out
-            apart.append(unit(light - point) - out)
-        return np.concatenate(apart).ravel()
-
-    if not start:
-        return {}
-    # the lines to the highlights meet before the centre
-    eyes = np.array([camera.centre for camera in cameras.values()])
-    front = np.array([*start.values()])
-    back = np.array([unit(centre - eyes).mean(axis=0) for centre in front])
-    starts = [(front + part * radius * back).ravel() for part in BEHIND]
-    best = min(starts, key=lambda x: float(np.abs(misses(x)).sum()))
-    converged = True
-    for outlier in OUTLIERS:
-        fit = least_squares(
-            misses, best, loss="soft_l1", f_scale=outlier, max_nfev=MAX_PLACE_STEPS
+    def misses(x: Float64, size: float | None = None) -> Float64:
+        balls, lights = np.split(
+            x[: count + 3 * len(seen)].reshape(-1, 3), [len(front)]
         )
+        size = radius * np.exp(x[-1]) if size is None else size
+        return (_sights(eye, balls[at], size, lights[of]) - view).ravel()
+
+    def start(part: float) -> Float64:
+        # the lines to the highlights meet before the centre
+        back = [
+            unit(centre - eye[at == k]).mean(axis=0) for k, centre in enumerate(front)
+        ]
+        balls = front + part * radius * np.array(back)
+        point, out, _ = _mirrored(eye, view, balls[at], radius)
+        lights = [_meeting(point[of == i], out[of == i]) for i in range(len(seen))]
+        return np.concatenate([balls.ravel(), np.ravel(lights), [0]])
+
+    best = min(map(start, BEHIND), key=lambda x: float(np.abs(misses(x)).sum()))
+    scale = np.repeat([1.0, 100, 0.03], [count, 3 * len(seen), 1])
+    adjust = partial(least_squares, misses, max_nfev=MAX_PLACE_STEPS)
+    for loss, outlier in OUTLIERS:
+        fit = adjust(best, loss=loss, f_scale=outlier, x_scale=scale)
         best = fit.x
-        converged &= fit.success
-    miss = np.degrees(np.median(lengths(fit.fun.reshape(-1, 3))))
-    # balls of a wrong size fit best far away, where all lines are parallel
-    away = lengths(fit.x.reshape(-1, 3) - front).max()
+    # in the median 1.18 standard deviations, of two angles a highlight
+    angle = np.median(lengths(fit.fun.reshape(-1, 3))) / 1.18
+    noise = angle**2 * 2 * len(view) / max(2 * len(view) - len(best), 1)
+    spread = np.sqrt(noise * np.linalg.pinv(fit.jac.T @ fit.jac)[-1, -1])
+    found = radius * np.exp(best[-1])
+    miss = angle * np.median(lengths(front[at] - eye))
+    agrees = abs(best[-1]) < MAX_SIZE_MISMATCH + 3 * spread and miss < MAX_MISS * radius
     require(
-        converged and miss <= MAX_MISS_DEGREES and away <= 2 * radius,
+        fit.success and agrees,
         "mirror ball",
-        f"its highlights must agree with a ball of radius {radius:g} mm within "
-        f"{MAX_MISS_DEGREES:g} degrees",
-        f"{miss:.1f} degrees, {away:.0f} mm from where the lines to them meet"
-        f"{'' if converged else ', and still moving'}",
+        f"its highlights must be those of a ball of radius {radius:g} mm",
+        f"of {found:.3g} +- {found * spread:.1g} mm, missed by {miss:.1g} mm",
         "give the radius of the ball in mm, and remove other bright things from the pictures",
     )
-    return dict(zip(start, fit.x.reshape(-1, 3), strict=True))
+    of_size = {"x_scale": scale[:-1], "args": (radius,)}
+    fit = adjust(best[:-1], loss=loss, f_scale=outlier, **of_size)
+    return dict(zip(places, fit.x[:count].reshape(-1, 3), strict=True))
+
+
+def _meeting(points: Float64, directions: Float64) -> Float64:
+    """Where rays meet best; far away along them if they are parallel."""
+    try:
+        return light_position(points, directions).position
+    except InputError:
+        return points.mean(axis=0) + FAR_MM * unit(directions.mean(axis=0))
 
 
 def ball_centre(

@@ -375,6 +375,8 @@ def test_ball_places__from_highlights_alone(pictures):
     for place, centre in PLACES.items():
         # as by outlines: highlights are known to a tenth of a pixel of 0.8 mm
         np.testing.assert_allclose(found[place], centre, atol=0.5)
+    with pytest.raises(InputError, match="of a ball of radius 60 mm; found of 29"):
+        ball_places(cameras, highlights, 2 * RADIUS)
     one = [{key: at for key, at in h.items() if key[1] == "c0"} for h in highlights]
     with pytest.raises(InputError, match="two cameras must see its highlights"):
         ball_places(cameras, [one[0] | {("b", "c1"): np.zeros(2)}], RADIUS)
@@ -427,3 +429,34 @@ def test_positioned_dome__needs_every_light(setup):
         InputError, match="must have every light of the capture; found none of l2"
     ):
         positioned_dome(dome, found.isel(light=[0, 1]), where="calibration x")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_ball_places__of_random_domes_with_some_wrong_highlights(seed):
+    rng = np.random.default_rng(seed)
+    cameras = {
+        f"c{i}": camera_at(place) for i, place in enumerate(_around(rng, 4, 830))
+    }
+    balls = {f"p{k}": place for k, place in enumerate(rng.uniform(-60, 60, (3, 3)))}
+    highlights = []
+    for light in _around(rng, 16, 880):
+        found = {}
+        for name, camera in cameras.items():
+            for place, ball in balls.items():
+                pixel = highlight_of(camera, ball, light)
+                wrong = rng.random() < 0.05
+                found[place, name] = pixel + rng.normal(
+                    scale=60 if wrong else 0.1, size=2
+                )
+        highlights.append(found)
+    centres = ball_places(cameras, highlights, BALL_RADIUS)
+    off = [np.linalg.norm(centres[place] - ball) for place, ball in balls.items()]
+    assert max(off) < 1.5  # a tenth of a pixel is 0.1 mm across and 1 mm along the view
+    with pytest.raises(InputError, match=r"a ball of radius 37\.5 mm; found of 2[45]"):
+        ball_places(cameras, highlights, 1.5 * BALL_RADIUS)
+
+
+def _around(rng, count, distance):
+    """Places (count, 3) on the front of a sphere."""
+    way = np.array([0, 0, 3.0]) + rng.normal(size=(count, 3))
+    return distance * way / np.linalg.norm(way, axis=1, keepdims=True)

@@ -237,7 +237,7 @@ def test_calibrate__completes_a_dome_without_geometry(lab, tmp_path):
     (lab / "dome/calibration.json").write_text(
         json.dumps({"ball": ball | {"radius": 3.0}})
     )
-    with pytest.raises(InputError, match="must agree with a ball of radius 3 mm"):
+    with pytest.raises(InputError, match="must be those of a ball of radius 3 mm"):
         workflow.calibrate(db, lab, name="dome-a")
     assert (lab / "dome/dome.json").read_text() == before
     (lab / "dome/calibration.json").write_text(json.dumps({"ball": ball}))
