@@ -42,7 +42,7 @@ OUTLINE_POINTS = 32  # lines of sight to the outline of a ball
 MAX_SIZE_MISMATCH = 0.05
 # of reweighting by distance; five change the position by less than a micrometre
 ROUNDS = 20
-# from which the places of a ball are found; each has six unknowns
+# from which the places of a ball are found; each adds three unknowns
 MAX_PLACE_LIGHTS = 24
 MAX_PLACE_STEPS = 60  # of a fit; random domes with the right radius needed at most 48
 # radii: from highlights on the front to those of its edge
