@@ -396,6 +396,10 @@ REGION_SURFACE_REFLECTANCE_ERROR = declare(
     "float64 tables/region_surface_reflectance_error(region) [1]",
     "standard error of the mean, from its scatter between patches of the region",
 )
+REGION_SURFACE_REFLECTANCE_TOTAL_ERROR = declare(
+    "float64 tables/region_surface_reflectance_total_error(region) [1]",
+    "standard error of the mean with the errors of the model, which takes have in common",
+)
 REGION_GLOSSINESS = declare(
     "float64 tables/region_glossiness(region) [1]",
     "mean of glossiness over the same surfels, weighted by the light that they reflect",
@@ -403,6 +407,10 @@ REGION_GLOSSINESS = declare(
 REGION_GLOSSINESS_ERROR = declare(
     "float64 tables/region_glossiness_error(region) [1]",
     "standard error of the mean, from its scatter between patches of the region",
+)
+REGION_GLOSSINESS_TOTAL_ERROR = declare(
+    "float64 tables/region_glossiness_total_error(region) [1]",
+    "standard error of the mean with the errors of the model, which takes have in common",
 )
 REGION_ALBEDO_CONTRAST = declare(
     "float64 tables/region_albedo_contrast(region, channel) [1]",

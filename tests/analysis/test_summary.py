@@ -7,7 +7,12 @@ import pytest
 from planted_population import model_of, population
 
 from skindb.analysis import cohort_of, region_tables, sample_surfels, summary_tables
-from skindb.analysis.summary import MAX_HALF_ANGLE, PATCH_SIZE, trusted_surfels
+from skindb.analysis.summary import (
+    MAX_HALF_ANGLE,
+    MODEL_ERRORS,
+    PATCH_SIZE,
+    trusted_surfels,
+)
 from skindb.errors import InputError
 from skindb.schema import dataset
 from skindb.schema.declaration import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
@@ -235,3 +240,15 @@ def test_cohort_of__who_refused_is_skipped():
         {"take": "B", "reason": "its consent does not cover statistics"}
     ]
     assert cohort["age"].values.tolist() == [20, 20, 50]
+
+
+def test_region_tables__errors_of_the_model_are_in_proportion_to_the_mean():
+    fitted = _fitted().assign(
+        glossiness=("surfel", np.full(N, 0.6)),
+        glossiness_error=("surfel", np.full(N, 0.01)),
+    )
+    every = np.ones(N, bool)
+    table = region_tables(fitted, {"lips": every, "chin": every})
+    for name, relative in MODEL_ERRORS.items():
+        squares = table[f"{name}_total_error"] ** 2 - table[f"{name}_error"] ** 2
+        np.testing.assert_allclose(np.sqrt(squares) / table[name], relative)
