@@ -5,8 +5,6 @@ point: tristimulus values are those under the illuminant D65 for the 2 degree ob
 pictures of `skindb.render` have them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

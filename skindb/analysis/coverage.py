@@ -119,7 +119,7 @@ def _factors(
     """
     names = np.array(takes.names)
     who = np.array(takes.subject)
-    factors: dict[str, Factor] = {}
+    factors = {}
     for name, attribute in stated.items():
         if name == AGE:
             factors[AGE_BAND] = _age_bands(attribute.numbers)

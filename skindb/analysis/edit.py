@@ -107,7 +107,7 @@ def apply_traits(
     amount = _trait_amounts(amounts, traits)
     fitted = model["fitted"].to_dataset().load()
     tree = model.copy()
-    reports: dict[str, Report] = {}
+    reports = {}
     shift = amount @ traits[variables.TRAIT_BRDF_SHIFT].values
     fitted, reports["brdf"] = _moved_surface(fitted, shift, basis, brdf_metric(tables))
     mixture = basis[variables.POPULATION_MIXTURE].values
@@ -216,7 +216,7 @@ def _mean(fitted: Dataset, values: Array) -> Array:
     """Area-weighted mean (...) of values (n, ...) over the surfels that have any."""
     good = finite_rows(values)
     area = fitted[variables.SURFEL_AREA].values[good].astype(float)
-    return np.asarray(np.average(values[good], axis=0, weights=area))
+    return np.average(values[good], axis=0, weights=area)
 
 
 def move_along_modes(
@@ -525,4 +525,4 @@ def _length(vectors: Array, metric: Array) -> Array:
 def shift_quantiles(values: Array, source: Array, shift: Array, edges: Array) -> Array:
     """Values (n,) plus the shift (levels,) at their quantile of the histogram `source` (bins,)."""
     quantile = np.interp(values, edges, cumulative(source))
-    return np.asarray(values + np.interp(quantile, quantile_levels(), shift))
+    return values + np.interp(quantile, quantile_levels(), shift)

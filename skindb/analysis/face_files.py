@@ -1,7 +1,5 @@
 """Models of faces as files with the field names of AlbedoMM (Smith et al. 2020)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -4,8 +4,6 @@ translucency together on the common (u, v), by probabilistic principal component
 (Cootes et al. 2001).
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple

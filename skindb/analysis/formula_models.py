@@ -139,13 +139,13 @@ def linear_model(
         numbers = frame[["value", BASELINE]]
         frame[["value", BASELINE]] = np.log(numbers.where(numbers > 0))
     frame = with_levels(model, frame.dropna(subset=["value", *used]))
-    fits: dict[str, _Fit] = {}
+    fits = {}
     flags = _flags(model, measured, frame)
     if late := sorted(_late_baselines(measured)) if BASELINE in used else []:
         flags.append(
             f"the baseline of {', '.join(late)} is of a later visit than others"
         )
-    reasons: list[str] = []  # of regions without a model
+    reasons = []  # of regions without a model
     for (region, channel), part in frame.groupby(
         ["region", "channel"], sort=False, dropna=False
     ):

@@ -57,7 +57,7 @@ class MixedModel:
                 fixed
             ),
         }
-        slopes: list[str] = []
+        slopes = []
         nested = ""
         for effects, group in random:
             # a + in backticks is part of a name
@@ -106,7 +106,7 @@ def with_levels(model: MixedModel, frame: pd.DataFrame) -> pd.DataFrame:
     """The rows, with words and C(NAME) as categories, so that terms mean the same in
     all regions; `InputError` for a word that does not differ.
     """
-    words: dict[str, pd.Categorical] = {}
+    words = {}
     for name in model.names:
         values = frame[name]
         is_number = pd.api.types.is_numeric_dtype(values)

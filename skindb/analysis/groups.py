@@ -197,7 +197,7 @@ def _reference(contrast: Contrast, fit: Effects) -> Array:
     if contrast.is_number:
         return known_mean(values)
     centre = known_mean(np.where(is_known, contrast.regressor[:, None], np.nan))
-    return np.asarray(known_mean(values) - fit.slope * centre)
+    return known_mean(values) - fit.slope * centre
 
 
 def _percent(

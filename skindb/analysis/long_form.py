@@ -1,7 +1,5 @@
 """A cohort as a table with one row for each value, for pandas, seaborn, statsmodels and R."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
 from dataclasses import replace

@@ -156,8 +156,8 @@ def _quantity_maps(
 ) -> tuple[list[Dataset], list[str], list[Fault]]:
     """Maps of the quantities with the same comparisons, and flags and faults of all."""
     parts: list[Dataset] = []
-    flags: list[str] = []
-    faults: list[Fault] = []
+    flags = []
+    faults = []
     for quantity in [quantity for quantity in chosen if quantity.mapped in cohort]:
         measure = partial(_texel_quantities, quantity=quantity, size=size)
         compared, undetermined = compare(measure)

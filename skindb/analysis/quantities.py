@@ -220,7 +220,7 @@ def within_deviation(values: Array, subject: Sequence[str]) -> Array:
             free += np.maximum(moments.count - 1, 0)
             repeated += moments.count > 1
     variance = second / np.maximum(free, 1)
-    return np.asarray(np.where(repeated >= MIN_SUBJECTS, np.sqrt(variance), np.nan))
+    return np.where(repeated >= MIN_SUBJECTS, np.sqrt(variance), np.nan)
 
 
 def take_spacing(tables: Dataset) -> Array:
@@ -367,9 +367,9 @@ def quantities_of(cohort: Dataset, names: Sequence[str] = ()) -> Quantities:
         If a name is unknown, or no take has any of these quantities.
     """
     half_width = NORMAL_95 * float(np.nan_to_num(level_error(cohort)))
-    columns: list[Array] = []
-    errors: list[Array] = []
-    described: list[tuple[str, bool, float]] = []
+    columns = []
+    errors = []
+    described = []
     for measured in measurements(cohort, names or DEFAULT):
         quantity = measured.quantity
         count = len(measured.values)

@@ -57,7 +57,7 @@ def region_masks(common_uv: Array, landmarks: Mapping[str, Array]) -> dict[str, 
         places["lip_lower"] = corners + LOWER_LIP * (corners - places["lip_upper"])
     drawn = {name: _region_mask(name, common_uv, places) for name in (*FINE, "beard")}
     taken = np.zeros(len(common_uv), bool)
-    masks: dict[str, Mask] = {}
+    masks = {}
     for name in FINE:
         if (mask := drawn[name]) is not None:
             masks[name] = mask & ~taken

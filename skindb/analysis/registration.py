@@ -301,7 +301,7 @@ def tabulate_registration(registered: Registered) -> tuple[list[str], list[list[
     header = (
         "take warp landmarks smoothing misfit_mm predicted_mm worst_mm worst anchors"
     ).split()
-    rows: list[list[Any]] = []
+    rows = []
     for take, registration in registered.items():
         scale = float(registration[variables.MM_PER_UV])
         misfit, error = (

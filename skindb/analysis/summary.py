@@ -272,7 +272,7 @@ def trusted_surfels(fitted: Dataset) -> Mask:
     if variables.FIT_SAMPLES in fitted:
         enough = fitted[variables.FIT_SAMPLES].values >= MIN_SAMPLES_TRUSTED
         good &= enough | ~(good & enough).any()
-    return np.asarray(good & finite_rows(fitted[variables.DIFFUSE_REFLECTANCE].values))
+    return good & finite_rows(fitted[variables.DIFFUSE_REFLECTANCE].values)
 
 
 def _patch_mean(

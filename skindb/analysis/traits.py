@@ -127,7 +127,7 @@ def trait_vectors(
     subjects = subjects_of(cohort)
     split = _split_takes(subjects)
     require_adjustable(subjects, adjust)
-    units: dict[str, Units] = {}
+    units = {}
     flags = []
     for name, (carries, lacks) in split.items():
         try:

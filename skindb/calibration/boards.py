@@ -1,7 +1,5 @@
 """Cameras from photographs of a ChArUco board: detection by OpenCV, and bundle adjustment."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -274,8 +272,8 @@ def _start(
     """Numbers of the cameras and poses of the board, by chaining those that share most corners."""
     import cv2
 
-    single: dict[str, Float64] = {}
-    seen = dict[tuple[str, int], Float64]()  # (4, 4), from the board to a camera
+    single = {}
+    seen = {}  # (4, 4), from the board to a camera
     for camera, poses in poses_of.items():
         views = [boards.views[camera, pose] for pose in poses]
         _, K, bent, turns, shifts = cv2.calibrateCamera(
@@ -294,7 +292,7 @@ def _start(
                 np.concatenate([np.ravel(turn), np.ravel(shift)])
             )
     poses_at = {1: np.eye(4)}  # from the board to the frame of the first pose
-    cameras_at = dict[str, Float64]()  # from that frame to the camera
+    cameras_at = {}  # from that frame to the camera
     order = sorted(seen, key=lambda view: -len(boards.views[view][0]))
     while edges := [v for v in order if (v[0] in cameras_at) != (v[1] in poses_at)]:
         camera, pose = edges[0]

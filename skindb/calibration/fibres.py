@@ -14,7 +14,7 @@ from skindb.calibration.radiance import Image, merge_exposures
 from skindb.calibration.setup import of_devices
 from skindb.errors import Fault, InputError, attempt, require, require_none
 from skindb.format.contact_probe import ProbeRecord
-from skindb.format.frames import Digests, Frame, read_frame, read_frames
+from skindb.format.frames import Digests, read_frame, read_frames
 from skindb.limits import MAX_FIBRE_PIXELS
 from skindb.numerics.statistics import robust_deviation
 from skindb.schema import dataset
@@ -39,7 +39,7 @@ def placement_signal(
     saturated in every bracket.
     """
     fibres = list[Index]()
-    strips = list[Frame]()
+    strips = []
     faults = list[Fault]()
 
     def read_strip(exposure: str) -> None:
@@ -95,7 +95,7 @@ def fibre_pixels(probe: ProbeRecord, shape: tuple[int, ...]) -> list[Index]:
         With every fibre without a pixel, or if the fibres cover more pixels than the
         memory is planned for.
     """
-    fibres = list[Index]()
+    fibres = []
     total = 0
     for centre, radius in zip(probe.centre, probe.radius, strict=True):
         (left, right), (top, bottom) = (

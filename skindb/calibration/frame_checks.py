@@ -291,7 +291,7 @@ def level_notes(dome: DomeRecord, highest: Float64, clipped: Mask) -> list[str]:
     highest, clipped
         (light, camera) results of `highest_value`; NaN for views of an earlier run.
     """
-    notes = list[str]()
+    notes = []
     for c, camera in enumerate(dome.cameras):
         sensor = camera.sensor
         values = highest[np.isfinite(highest[:, c]), c]

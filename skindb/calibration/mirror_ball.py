@@ -345,8 +345,8 @@ def ball_centre(
     """
     turn = np.linspace(0, 2 * np.pi, OUTLINE_POINTS, endpoint=False)
     around = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    directions = list[Float64]()
-    distances = list[float]()
+    directions = []
+    distances = []
     for camera, circle in zip(cameras, float64(outlines), strict=True):
         sight = camera.rays(circle[:2] + circle[2] * around)
         # all lines make the same angle with the axis: sight . axis = cos(angle)
@@ -433,7 +433,7 @@ def calibrate_positions(dome: DomeRecord, ball: BallFrames) -> xr.Dataset:
         With every frame that cannot be read, and every light that is seen in fewer than two frames.
     """
     cameras = {camera.id: camera for camera in dome.cameras}
-    centres = dict[str, Float64]()
+    centres = {}
     faults = list[Fault]()
     with ThreadPoolExecutor(THREADS) as pool:
         highlights = attempt_all(

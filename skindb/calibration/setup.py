@@ -313,7 +313,7 @@ def _chart_in_holder(
     dome: DomeRecord, pitch: float
 ) -> tuple[dict[str, Float64], float]:
     """Patches in the picture of every camera that sees all of them, and a radius in px."""
-    places = dict[str, Float64]()
+    places = {}
     radius = np.inf
     for camera in dome.cameras:
         place = camera.project(chart_places(pitch))
@@ -362,7 +362,7 @@ def _known_points(dome: DomeRecord, item: Fields) -> dict[str, KnownPoints]:
     if not positions.at_most(MAX_KNOWN_POINTS, "points"):
         return {}
     position = {name: positions.array(name, (3,)) for name in positions.data}
-    points = dict[str, KnownPoints]()
+    points = {}
     for camera in _named_cameras(dome, by_camera):
         pixels = by_camera.object(camera)
         pixel = {name: pixels.array(name, (2,)) for name in pixels.data}
@@ -380,7 +380,7 @@ def _known_points(dome: DomeRecord, item: Fields) -> dict[str, KnownPoints]:
 def _ball_frames(dome: DomeRecord, item: Fields) -> BallFrames:
     """The key "ball"."""
     template = _template(dome, item, "frames", {PLACE, LIGHT, CAMERA})
-    outlines = dict[str, dict[str, Float64]]()
+    outlines = {}
     if item.has("outlines"):
         places = item.object("outlines")
         if places.at_most(MAX_BALL_PLACES, "places of the ball"):
@@ -396,7 +396,7 @@ def _ball_frames(dome: DomeRecord, item: Fields) -> BallFrames:
 
 def _outlines(dome: DomeRecord, circles: Fields) -> dict[str, Float64]:
     """Outline of the ball in each camera that sees it."""
-    outlines = dict[str, Float64]()
+    outlines = {}
     for name, camera in _named_cameras(dome, circles).items():
         circle = circles.array(name, (3,))
         column, row, radius = circle

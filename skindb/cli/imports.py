@@ -1,7 +1,5 @@
 """Commands for pictures that people already have: import, quick."""
 
-from __future__ import annotations
-
 import signal
 import sys
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """Commands for the laboratory: capture, check-device, calibrate, landmarks."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

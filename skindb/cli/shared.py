@@ -164,7 +164,7 @@ def each_take(
         it, and lines to print.
     """
     results: Json = {}
-    faults: list[Fault] = []
+    faults = []
     workers = asked("workers") or 1
     # so that the running take is known
     in_turn = not asked("scheduler") and (workers == 1 or len(takes) == 1)
@@ -352,7 +352,7 @@ def trait_amounts(
     click.UsageError
         If a text has another form, or an amount is not a finite number.
     """
-    amounts: dict[str, float] = {}
+    amounts = {}
     for text in texts:
         name, equals, number = text.partition("=")
         try:

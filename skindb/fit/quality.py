@@ -206,13 +206,12 @@ def _quantiles(values: AnyArray, area: AnyArray) -> AnyArray:
     finite = np.isfinite(values) & (area > 0)
     if not finite.any():
         return np.full(len(QUANTILES), np.nan)
-    quantiles = np.quantile(
+    return np.quantile(
         values[finite],
         [*QUANTILES.values()],
         weights=area[finite],
         method="inverted_cdf",
     )
-    return np.asarray(quantiles)
 
 
 def _mean(values: AnyArray, area: AnyArray) -> float:

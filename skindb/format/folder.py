@@ -507,7 +507,7 @@ class _Reader:
                 "a region of that name",
                 "rename it",
             )
-        regions = dict[str, Index]()
+        regions = {}
         for name in fields.data:
             vertices = _vertices(fields, name, len(scan.vertices))
             if vertices is not None:

@@ -624,7 +624,7 @@ def require_own_files(
     `views` are the key of the template, the path, and the names in it.
     """
     owners = dict[Path, dict[str, str]]()
-    shared = list[tuple[str, str]]()
+    shared = []
     for key, name, names in views:
         owner = owners.setdefault(Path(name), names)
         if owner != names:

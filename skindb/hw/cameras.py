@@ -161,7 +161,7 @@ class FolderCameras:
         """Image files of a camera that are not complete; one that is renamed or removed
         at this moment is skipped.
         """
-        files = list[tuple[Path, os.stat_result]]()
+        files = []
         try:
             for path in (self.root / name).iterdir():
                 if path.suffix.lower() in FRAME_SUFFIXES and path not in complete:

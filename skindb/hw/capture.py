@@ -272,7 +272,7 @@ def _measure_sites(
     One that leaks or loses a frame is repeated; after any other failure of the probe, the session
     ends. Returns notes on those that were repeated.
     """
-    notes = list[str]()
+    notes = []
     complete = {(entry["site"], entry["number"]) for entry in session.sites}
     for site, number in product(plan.sites, range(1, plan.placements + 1)):
         for attempt in range(ATTEMPTS if (site, number) not in complete else 0):

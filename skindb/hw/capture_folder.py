@@ -28,7 +28,6 @@ from skindb.files import make_private, private_file
 from skindb.format.dome import CameraRecord, DomeRecord
 from skindb.format.fields import Fields, read_json
 from skindb.format.frames import (
-    Frame,
     FrameKind,
     is_linear,
     read_exposures,
@@ -267,7 +266,7 @@ def read_setup(folder: Path) -> Setup:
     record = read_json(dome.file, faults)
     file = folder / PROBE_FILE
     probe = None
-    brackets = dict[str, float]()
+    brackets = {}
     if file.is_file() and (probe := read_json(file, faults)) is not None:
         fields = Fields(probe, str(file), faults)
         brackets = read_exposures(fields)
@@ -398,7 +397,7 @@ def _write_mean(paths: Sequence[Path], target: Path, kind: FrameKind) -> None:
     if len(paths) == 1 or is_linear(paths[0]):
         copy_frame(paths[0], target)
         return
-    frames = list[Frame]()
+    frames = []
     for path in paths:
         with suppress(InputError):
             frames.append(read_frame(path, kind))

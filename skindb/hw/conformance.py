@@ -91,7 +91,7 @@ class _Device:
     ) -> list[Message]:
         """Replies that arrive within so many seconds, or until those with these numbers."""
         end = self.clock.monotonic() + seconds
-        replies = list[Message]()
+        replies = []
         due = list(numbers)
         while self.clock.monotonic() < end and (due or not numbers):
             for message in self._lines.feed(self._port.read(4096)):

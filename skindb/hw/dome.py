@@ -162,7 +162,7 @@ class Dome:
         DeviceError
             If the controller stops answering, makes no progress, or sends what cannot be right.
         """
-        reports = list[Measured]() if done is None else done
+        reports = [] if done is None else done
         clock = self.link.clock
         with stopped_at_end(self.stop):
             requested = clock.monotonic()

@@ -83,7 +83,7 @@ def with_markers(schedule: Schedule, light: str, *, first: int = 0) -> Schedule:
     gap = round(GAP_SECONDS * 1e6)
     # all numbers of one run differ
     interval = max(INTERVAL, math.ceil(len(schedule.steps) / (2**BITS - 4)))
-    steps = list[Step]()
+    steps = []
     start = 0
     number = first
     begin = 0  # of the part
@@ -191,7 +191,7 @@ def identify_frames(
     if not markers:
         return {}, [f"no flashes of the marker light {steps[0].light}"]
     frames = dict[int, Path]()
-    problems = list[str]()
+    problems = []
     for part in _parts(steps):
         begin, end = (
             markers[_number([steps[i] for i in marker])]

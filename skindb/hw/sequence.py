@@ -79,7 +79,7 @@ class Schedule:
         interval as in this one.
         """
         start = 0
-        chosen = list[Step]()
+        chosen = []
         for index in sorted(set(steps)):
             step = self.steps[index]
             length = step.off_us - step.on_us
@@ -151,7 +151,7 @@ def plan_schedule(
             "allow more time, or shorten the exposures",
         )
     stretch = 0.0 if seconds is None else (seconds - shortest) / len(pairs)
-    steps = list[Step]()
+    steps = []
     start = 0.0
     for light, name in pairs:
         on = round(start * 1e6)
@@ -252,7 +252,7 @@ def slowed_schedule(schedule: Schedule, flashes: int = MAX_FLASHES) -> Schedule:
     """
     period = WINDOW_US // max(flashes, 1) + 1
     after = [step.on_us for step in schedule.steps[1:]] + [0]
-    steps = list[Step]()
+    steps = []
     start = 0
     for step, following in zip(schedule.steps, after, strict=False):
         steps.append(

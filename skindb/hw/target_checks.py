@@ -1,7 +1,5 @@
 """Checks of frames of calibration targets, while the target is still in the dome."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -80,7 +78,7 @@ def target_faults(
     files
         (camera, step) -> frame.
     """
-    faults = list[Fault]()
+    faults = []
     if target.kind in SEEN:
         seen = {
             camera.id: SEEN[target.kind](
@@ -103,7 +101,7 @@ def target_faults(
             ]
         if target.kind == "ball":
             return _dark_lights(target, steps, set().union(*seen.values()))
-    bright = set[str]()
+    bright = set()
     longest = max(target.seconds, key=target.seconds.__getitem__)
     with ThreadPoolExecutor(THREADS) as pool:
         for camera in cameras:
@@ -247,7 +245,7 @@ def _highlights(target: Target, camera: CameraRecord, frames: Frames) -> set[str
     limit = camera.sensor.black + MIN_LIGHT * (
         camera.sensor.white - camera.sensor.black
     )
-    found = set[str]()
+    found = set()
     for light, file in lights.items():
         frame = read_frame(file, camera.sensor.kind)
         if frame.max() > limit and highlight_of(camera, frame) is not None:

@@ -1,7 +1,5 @@
 """`ingest_capture`: turns a capture folder into a DataTree of kind "capture"."""
 
-from __future__ import annotations
-
 import ctypes
 import gc
 from collections.abc import Iterator, Mapping

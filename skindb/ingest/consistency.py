@@ -2,8 +2,6 @@
 the lights by the shading.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -187,7 +185,7 @@ class CalibrationCheck:
         albedo: Float64,
     ) -> Brightness:
         """Relative brightness of the photographs by camera and light."""
-        factors = list[Float64]()
+        factors = []
         for view in views:
             pixels = moved_pixels(view, offsets[view.camera])
             colour = self.intensity[view.light] / self.intensity[view.light].mean()
@@ -238,8 +236,8 @@ class CalibrationCheck:
         """Views with enough surfels of varying irradiance that are not black, as they
         are when a lamp fails.
         """
-        views = list[ReducedView]()
-        brightness = list[float]()
+        views = []
+        brightness = []
         for (j, c), picture in sorted(pictures.items()):
             clear = self._clear[:, c]
             light = self.irradiance[j, clear]

@@ -5,8 +5,6 @@ What a texel differs by from the interpolated surfels is its detail: it is 0 at 
 whose values are those of the fit, and what Lambert's law ignores cancels in the difference.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Self

@@ -2,8 +2,6 @@
 calibrations that the photographs contradict.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The labelled groups of a version of kind "capture"."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -44,7 +42,7 @@ def surfel_group(
         "surfel_uv": surfels.uv,
         "scan_normal_error": scan_error,
     }
-    coords = dict[str, list[str]]()
+    coords = {}
     if surfels.region_names:
         variables["region_mask"] = surfels.region.astype(np.int8)
         coords["region"] = list(surfels.region_names)
@@ -64,7 +62,7 @@ def surfel_group(
 def mesh_group(capture: Capture, surfels: SurfelSet) -> xr.Dataset:
     """Group "mesh"."""
     variables: dict[str, Any] = {"triangle": surfels.faces}
-    coords = dict[str, list[str]]()
+    coords = {}
     if capture.landmarks:
         position, distance = transferred_landmarks(capture, surfels)
         variables |= {

@@ -1,7 +1,5 @@
 """Tables of lights: CSV, and .lp files of reflectance transformation imaging."""
 
-from __future__ import annotations
-
 import csv
 import re
 from collections.abc import Sequence
@@ -54,7 +52,7 @@ def read_lights(path: Path, pictures: Sequence[str] = ()) -> list[Light]:
         text = read_regular(path, MAX_TABLE_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise _table_fault(path, "must be UTF-8 text", "another encoding") from None
-    faults = list[Fault]()
+    faults = []
     found = list[Light]()
     header = list[str]()
     lines = [_words(line) for line in text.splitlines()]

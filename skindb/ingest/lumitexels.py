@@ -209,7 +209,7 @@ class Sampler:
             that the photographs contradict.
         """
         calibration = None
-        contradictions = list[Fault]()
+        contradictions = []
         pictures = self.pictures(self.check.pairs if check else ())
         if check and not self.faults:
             calibration = self.check.evaluate(pictures)

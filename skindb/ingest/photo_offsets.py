@@ -6,8 +6,6 @@ about `PIXEL_MM` of the face: the effects that the prediction ignores (gloss, li
 between parts of the face, hair) have a size on the face, independent of the resolution.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

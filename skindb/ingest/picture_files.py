@@ -1,7 +1,5 @@
 """Picture files of cameras that are no sensors of a dome: PNG, TIFF, JPEG, BMP, OpenEXR."""
 
-from __future__ import annotations
-
 import io
 import struct
 import warnings

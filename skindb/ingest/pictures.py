@@ -2,8 +2,6 @@
 lights, or light-stage folders with one picture for each light and camera.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -478,8 +476,8 @@ def _matched(source: Path, files: Sequence[Path], table: Sequence[Light]) -> lis
     """The pictures of the lights, by name or without its suffix."""
     by_name = {_folded(file.name): file for file in files}
     by_stem = {_folded(file.stem): file for file in files}
-    faults = list[Fault]()
-    pairs = list[Path]()
+    faults = []
+    pairs = []
     for light in table:
         name = _folded(light.name)
         file = by_name.get(name) or by_stem.get(name) or by_stem.get(Path(name).stem)

@@ -3,8 +3,6 @@
 10).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -107,7 +105,7 @@ def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profil
         With every frame that cannot be decoded, and fibres that lie outside the picture.
     """
     faults = list[Fault]()
-    by_site = list[list[tuple[Float64, Float64]]]()
+    by_site = []
     for site in probe.sites:
         parts = [
             attempt(faults, partial(placement_signal, probe, site, name, digests))
@@ -146,7 +144,7 @@ def _light_faults(
     """Faults of placements whose frames are black or white: nearly no fibre shows light
     that is clear of noise.
     """
-    faults = list[Fault]()
+    faults = []
     minimum = min(MIN_LIT_FIBRES, len(probe.fibres))
     rule = f"at least {minimum} fibres must show light, and not be saturated in every bracket"
     for site, (values, errors) in zip(probe.sites, signals, strict=True):

@@ -2,8 +2,6 @@
 of one camera, integrated to a mesh.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace

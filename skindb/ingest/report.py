@@ -3,8 +3,6 @@ the files), and a report with the repairs of the scan and the number of samples 
 surfel, region, camera and light.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -40,7 +38,7 @@ def capture_provenance(
         for file in _files(capture)
     }
     dome = capture.dome
-    files = set[Path]()
+    files = set()
     if dome is not None:
         files.update(dome.frame_files("frames", "dark", "white"))
     if capture.probe is not None:

@@ -1,7 +1,5 @@
 """Cameras of light stages: JSON, and text models of COLMAP."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@ coordinates, regions; their visibility from lights and cameras, and the distance
 edges in the photographs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass

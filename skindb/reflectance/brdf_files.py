@@ -463,4 +463,4 @@ def fill_holes(brdf: Array) -> Array:
         )
         turned = np.take_along_axis(turned, nearest, axis=axis)
         brdf = np.flip(turned, axis) if backwards else turned
-    return np.asarray(brdf)
+    return brdf

@@ -6,7 +6,7 @@ dimension), so that each chunk is decompressed where its values belong. All othe
 and all other programs, read them by zarr.
 """
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,7 +53,7 @@ class ShardedArray(BackendArray):
             return np.asarray(self.rows(first, first + 1)[(0, *others)])
         begin, end, step = first.indices(self.shape[0])
         values = self.rows(begin, max(begin, end))
-        return np.asarray(values[(slice(None, None, step), *others)])
+        return values[(slice(None, None, step), *others)]
 
     def rows(self, begin: int, end: int) -> AnyArray:
         """Values from `begin` to `end` along the first dim, from whole chunks."""
@@ -139,7 +139,7 @@ def _lazy(store: VerifiedStore, group: str, ds: Dataset) -> Dataset:
     """
     if "surfel" not in ds.dims:
         return ds
-    arrays: dict[Hashable, ShardedArray] = {}
+    arrays = {}
     for name, variable in ds.data_vars.items():
         how = variable.encoding
         if _is_direct(how):

@@ -142,7 +142,7 @@ def read_audit(
     secret = attempt(faults, partial(require_secret, place))
     if secret is None:
         return [], faults
-    entries: dict[int, AuditEntry] = {}
+    entries = {}
     outcomes = in_parallel(partial(_outcome, place, secret), numbers)
     for number, outcome in zip(numbers, outcomes, strict=True):
         if isinstance(outcome, Fault):

@@ -310,7 +310,7 @@ def _draft(place: Place, markers: Markers) -> Draft:
         for key in listing
         if key.startswith(("audit/", "tombstones/")) and STATE_KEY.fullmatch(key)
     ]
-    items: list[Item] = []
+    items = []
     files |= intact(partial(_digest, place), small_files, faults)
     for record, manifest in intact(
         partial(read_manifest, place), records.values(), faults

@@ -1,7 +1,5 @@
 """Cohorts: data of many takes as one lazy Dataset; see `Database.cohort`."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -368,7 +366,7 @@ def _parts(
         )
     # identities of the contents of a version and of its capture, which thousands of
     # takes share -> these, and the layout
-    layouts: dict[tuple[int, int], tuple[Contents, Contents, Layouts]] = {}
+    layouts = {}
     parts = []
     for (take, version), address, source in zip(
         stored.items(), addresses, sources, strict=True

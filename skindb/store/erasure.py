@@ -393,8 +393,8 @@ def _unrecorded(
     a running writer writes the names first. Keys of unreadable records of the same kind
     and take are returned too, as one of them may be theirs.
     """
-    paths: list[str] = []
-    damaged: list[str] = []
+    paths = []
+    damaged = []
     for kind, take in takes_below(place, "data"):
         if kind in KINDS_OF_ONE_SUBJECT or markers.hides(kind, take):
             continue

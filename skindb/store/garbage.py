@@ -247,7 +247,7 @@ def _old_generations(place: Place, generations: int, now: Clock) -> Iterator[Gar
         generations >= 1, "generations", rule, str(generations), "choose a larger one"
     )
     listed: dict[Key, Record] = {}
-    waiting: list[Record] = []
+    waiting = []
     for log in committed_logs(place):
         records, faults = log.faults()
         if faults:  # the inputs that a damaged record names are unknown

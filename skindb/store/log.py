@@ -152,7 +152,7 @@ class Log:
         """The readable records, and the faults of the other records, of the chain of
         seals and of the head.
         """
-        records: list[Record] = []
+        records = []
         faults: list[Fault] = []
         head = self.head()
         listed = self.generations()

@@ -9,8 +9,6 @@ bucket it is called again afterwards: if it raises then, a replaced file is remo
 the caller must remove a created one.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re
@@ -69,7 +67,7 @@ def unguarded() -> None:
 def digests_of(parts: Iterable[bytes]) -> Digests:
     """Digests of the contents that these parts are together."""
     whole = hashlib.sha256()
-    blocks: list[str] = []
+    blocks = []
     rest = bytearray()
     for part in parts:
         whole.update(part)

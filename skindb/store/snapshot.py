@@ -236,7 +236,7 @@ def list_records(place: Place, kind: str = "") -> dict[Key, str]:
     InputError
         If the log holds heads: its folder, or that of a kind, was exchanged with theirs.
     """
-    identities: dict[Key, str] = {}
+    identities = {}
     for name, identity in place.identities(f"log/{kind}".rstrip("/")).items():
         path = f"{kind}/{name}" if kind else name
         listed_kind, take, file, *_ = [*path.split("/"), "", ""]

@@ -298,7 +298,7 @@ def request_content(request: Request) -> bytes:
 
 def read_requests(place: Place) -> tuple[list[Request], list[Fault]]:
     """The readable requests, and the faults of the others."""
-    requests: list[Request] = []
+    requests = []
     faults: list[Fault] = []
     for name in place.children(REQUESTS):
         if not re.fullmatch(REQUEST_NAME, name):

@@ -68,8 +68,8 @@ def database_faults(place: Place) -> list[Fault]:
         for name, levels in LAYOUT.items()
         for fault in _layout_faults(place, name, levels, beside)
     ]
-    faults: list[Fault] = []
-    records: list[Record] = []
+    faults = []
+    records = []
     damaged = set()  # logs with a missing or unreadable record
     for log in committed_logs(place):
         try:
@@ -125,7 +125,7 @@ def _layout_faults(
     finding = place.file_type(key)
     if finding != "folder":
         return [_type_fault(place, key, "folder", finding)] if finding else []
-    faults: list[Fault] = []
+    faults = []
     for name in place.children(key, links=True):
         child = f"{key}/{name}"
         if not re.fullmatch(levels[0], name):

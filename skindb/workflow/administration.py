@@ -177,7 +177,7 @@ def superseded_calibrations(db: Database) -> dict[str, list[str]]:
         Name of a calibration -> takes, in order. A damaged record counts as none:
         `Database.verify` names it.
     """
-    newest = dict[str, int]()
+    newest = {}
     for name in db.takes(CALIBRATION):
         record = intact_or_none(partial(db.record, CALIBRATION, name))
         if record is not None:
@@ -323,8 +323,8 @@ def _erase_from_backups(
     """Remove withdrawn subjects from every backup, and collect the faults of those
     where that failed.
     """
-    erased: list[int] = []
-    faults: list[Fault] = []
+    erased = []
+    faults = []
     for url in backups:
         try:
             erased.append(db.erase_from_backup(url, wait=wait))

@@ -351,7 +351,7 @@ def calibrate(
         geometry, cameras = measured_cameras(folder)
         geometry = with_placeholders(geometry)
     dome = read_setup_dome(folder, record=geometry or None)
-    groups = dict[str, Dataset]()
+    groups = {}
     frames = read_calibration_frames(dome)
     require(
         not geometry or (frames and frames.ball),
@@ -514,7 +514,7 @@ def _describe_cameras(calibration: Dataset) -> Json:
         "colour": variables.CHART_DIFFERENCE,
         "known points": variables.REPROJECTION_RMS,
     }
-    description = dict[str, Any]()
+    description = {}
     for name, variable in measures.items():
         values = calibration[variable]
         values = values.max(dim=[dim for dim in values.dims if dim != "camera"])

@@ -284,7 +284,7 @@ def register_takes(
     # small: every task gets all of them
     generations = {take: record.generation for take, record in models.items()}
     map_all = partial(map_takes, workers=workers, client=client)
-    outlines: dict[str, Outline] = {}
+    outlines = {}
     progress("outlines", 0, len(names))
     for take, shape in results_of(map_all(partial(_outline, db, generations), names)):
         outlines[take] = shape

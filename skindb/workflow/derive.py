@@ -107,7 +107,7 @@ def _parsed_digest(root: Path, starts: tuple[str, ...]) -> str:
 
 def _reached(root: Path, starts: Iterable[str]) -> dict[str, ast.Module]:
     """Syntax trees of modules and of those that they import."""
-    trees: dict[str, ast.Module] = {}
+    trees = {}
     pending = list(starts)
     while pending:
         module = pending.pop()

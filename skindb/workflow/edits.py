@@ -228,7 +228,7 @@ def basis_grid(
 def _radiance(model: DataTree, **options: Any) -> Float32:
     """Picture (h, w, 3) of a grid."""
     seen = render(model, **{"samples": SAMPLES, **options})
-    return np.asarray(seen["radiance"].values)
+    return seen["radiance"].values
 
 
 def _root_mean_square(values: Float32) -> float:

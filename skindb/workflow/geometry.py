@@ -156,7 +156,7 @@ def register_scan(
     InputError
         If a file is faulty, or the landmarks do not determine the pose.
     """
-    faults = list[Fault]()
+    faults = []
     if taken := [name for name in (*FILES, "pose.json") if (out / name).exists()]:
         cure = "choose another folder"
         faults.append(Fault(str(out), "must not hold them", ", ".join(taken), cure))

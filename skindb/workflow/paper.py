@@ -302,7 +302,7 @@ def _photographs(source: Source, picture: Path) -> list[str]:
     normal = source.table[source.table["condition"] == "normal"]
     takes = normal.groupby("subject").head(1).index.tolist()
     compared = dict[str, Comparison]()
-    refused = list[str]()
+    refused = []
     for take in takes:
         try:
             comparison = source.compared(str(take))

@@ -249,7 +249,7 @@ def translucency_grid(
         "name another site, or fit more takes",
     )
     rows = {}
-    chosen = dict[str, float]()
+    chosen = {}
     for i, extreme in enumerate((min, max)):
         progress("render", i, 2)
         take = extreme(lengths, key=lengths.__getitem__)

@@ -1,7 +1,5 @@
 """From a folder of pictures to maps and a page, without a database."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import tempfile

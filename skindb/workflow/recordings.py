@@ -2,8 +2,6 @@
 `calibrate` reads.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 import time
@@ -135,7 +133,7 @@ def record_target(
         fewest = MIN_PLACES.get(kind, 1)
         rule = f"must be at least {fewest} for a {kind}"
         require(places >= fewest, "--placements", rule, f"{places}", "record more")
-        notes = list[str]()
+        notes = []
         board = read_json(out / boards.FILE, []) if kind == "board" else {}
         for number in range(1, places + 1):
             kept = _names(kind, number, laboratory.dome.camera_ids, steps, seconds)
@@ -264,7 +262,7 @@ def _steps(
 
 def _schedule(steps: list[Taken], seconds: Mapping[str, float]) -> Schedule:
     """The steps with at most three flashes in a second, which need no confirmation."""
-    planned = list[Step]()
+    planned = []
     start = 0
     for light, exposure, _ in steps:
         length = round(1e6 * seconds[exposure])

@@ -1,17 +1,15 @@
 """Calibration of a rig from its own fitted takes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from xarray import DataArray, Dataset, DataTree
+from xarray import Dataset, DataTree
 
 from skindb.analysis.regions import own_masks
 from skindb.calibration.lights import is_same_rig, moved_lights, rig_lobes
 from skindb.errors import input_error, require
-from skindb.fit.corrections import MIN_GAIN_SPREAD, LightResiduals
+from skindb.fit.corrections import MIN_GAIN_SPREAD
 from skindb.fit.gloss import common_lobes, take_gloss
 from skindb.fit.lumitexels import lumitexels
 from skindb.fit.rig import (
@@ -91,10 +89,10 @@ def calibrate_rig(
         ", ".join(models) or "none",
         "ingest and fit more takes of the rig",
     )
-    inputs = list[Record]()
-    residuals = list[tuple[LightResiduals, dict[str, Float64]]]()
-    cameras = list[DataArray]()
-    gloss = list[Dataset]()
+    inputs = []
+    residuals = []
+    cameras = []
+    gloss = []
     positions = dict[str, Float64]()
     for number, (take, model) in enumerate(models.items()):
         progress("lights", number, len(models))
@@ -177,7 +175,7 @@ def _models(db: Database, takes: Sequence[str]) -> dict[str, Record]:
         allowed = [take for take in db.takes("model") if take not in refused]
         models = {take: current_model(db, take) for take in allowed}
         return {take: model for take, model in models.items() if model is not None}
-    found = dict[str, Record]()
+    found = {}
     for take in takes:
         db.record("capture", take)
         model = current_model(db, take)

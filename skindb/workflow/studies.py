@@ -122,8 +122,8 @@ def open_population(
     else:
         cohort = open_models("tables")
     registrations: Mapping[str, Record] = {}
-    frames: dict[str, Dataset] = {}
-    notes: list[Note] = []
+    frames = {}
+    notes = []
     if study.registers:
         if not takes:  # before anything is registered
             require_same_fit(cohort)
@@ -205,7 +205,7 @@ def _require_one_scale(db: Database, study: Study, inputs: Sequence[Record]) -> 
         f"{len(relative)} of {len(models)} takes without a white target",
         "name takes of one kind with --take",
     )
-    exposures = dict[float, str]()
+    exposures = {}
     for record in relative:
         for key in record.input_keys:
             with suppress(InputError):  # the capture was removed since

@@ -608,7 +608,7 @@ def map_takes(
 
 def results_of(outcomes: Iterable[Outcome[Take, Result]]) -> Iterator[Result]:
     """The results; at the end one `InputError` with the faults of every take that failed."""
-    faults: list[Fault] = []
+    faults = []
     for outcome in outcomes:
         if outcome.error is None:
             yield outcome.result()

@@ -81,7 +81,7 @@ def refresh(
         "edit": partial(_repeat_again, db, dictionary),
     }
     db.complete_erasures()
-    results = list[Refreshed]()
+    results = []
     for number, kind in enumerate(KINDS):
         progress("refresh", number, len(KINDS))
         with computing_on(client if kind == STUDY else None, db.folder):
@@ -244,7 +244,7 @@ def _register_again(
     registration = db.record("registration", stale[0].take)
     reference = registration.provenance.get("parameters", {}).get("reference") or None
     fault = "its consent does not cover statistics, or its model has no landmarks"
-    records: dict[str, Record] = {}
+    records = {}
     try:
         records = register_takes(db, reference=reference, **resources)
     except UnavailableError:
