@@ -52,7 +52,6 @@ from skindb.store.stale import (
     REQUEST_NAME,
     REQUESTS,
     Request,
-    request_content,
     request_from_json,
 )
 from skindb.store.verified import Manifest, manifest_from_json
@@ -386,7 +385,7 @@ def surviving(
     }
     remaining, removed, needed = remainder_of(present.values(), requests, markers)
     seals = {record.seal for record in remaining}
-    additions = {request.key: request_content(request) for request in needed}
+    additions = {request.key: request.content() for request in needed}
     for record in removed:
         additions[tombstone_of(record.seal)] = tombstone_content(record)
     return {

@@ -55,7 +55,6 @@ REGISTRATION = "registration"
 SCRATCH_NAME = re.compile(rf"({TAKE})-[0-9a-f]{{16}}")
 # start of the names of a version and of the files beside it
 STEM = re.compile(rf"({TIME_HEX})\.")
-Key = tuple[str, str, str]  # kind, take and seal of a version
 
 
 @dataclass(frozen=True)
@@ -66,8 +65,8 @@ class Holdings:
     takes: Mapping[tuple[str, str], int] = field(default_factory=dict)
     # other versions that refer to a subject, in the order of their removal
     versions: tuple[Record, ...] = ()
-    # those that are the newest of their kind and take
-    current: frozenset[Key] = frozenset()
+    # seals of those that are the newest of their kind and take
+    current: frozenset[str] = frozenset()
     # paths of unfinished versions of others that may contain data of a subject
     unrecorded: tuple[str, ...] = ()
     damaged: tuple[str, ...] = ()  # keys of unreadable records of such versions
@@ -117,17 +116,23 @@ def holdings_of(place: Place, markers: Markers) -> Holdings:
     # the newest of each kind and take after the others
     records = list(chain(*in_parallel(Log.readable, committed_logs(place))))
     doomed = _doomed(records, markers)
-    newest = {(record.kind, record.take): record for record in records}
-    current = {_key(record) for record in newest.values()}
+    newest = {(record.kind, record.take): record.seal for record in records}
     named = {record.path for record in records}
+    # unfinished versions and leases, too
+    own = {
+        (kind, take)
+        for top in FOLDERS_WITH_TAKES
+        for kind, take in takes_below(place, top)
+        if markers.hides(kind, take)
+    }
     unrecorded, damaged = _unrecorded(place, markers, named)
     return Holdings(
         takes={
             (kind, take): len(Log(place, kind, take).generations())
-            for kind, take in _own_takes(place, markers)
+            for kind, take in sorted(own, key=lambda key: (_rank(key[0]), key))
         },
         versions=tuple(doomed),
-        current=frozenset(current & {_key(record) for record in doomed}),
+        current=frozenset(newest.values()) & {record.seal for record in doomed},
         unrecorded=tuple(unrecorded),
         damaged=tuple(damaged),
         requests=tuple(
@@ -168,18 +173,18 @@ def remainder_of(
     """
     listed = list(records)
     removed = _doomed(listed, markers)
-    gone = set(map(_key, removed))
-    newest = {(record.kind, record.take): _key(record) for record in listed}
-    current = [
-        record for record in removed if newest[record.kind, record.take] == _key(record)
-    ]
-    replacements = (_replacement(record, gone) for record in current)
+    gone = {record.seal for record in removed}
+    newest = {(record.kind, record.take): record.seal for record in listed}
+    current = set(newest.values())
+    replacements = (
+        _replacement(record, gone) for record in removed if record.seal in current
+    )
     needed = [*requests, *filter(None, replacements)]
     changed = {request.key: request.without(markers.is_withdrawn) for request in needed}
     remaining = [
         record
         for record in listed
-        if _key(record) not in gone and not markers.hides(record.kind, record.take)
+        if record.seal not in gone and not markers.hides(record.kind, record.take)
     ]
     return remaining, removed, [*filter(None, changed.values())]
 
@@ -204,23 +209,17 @@ def erase(place: Place, subject: str, *, wait: float = 0.0) -> Erasure:
     """
     holdings = subject_holdings(place, subject)
     if not read_markers(place).is_withdrawn(subject):
-        takes = sorted(
-            {
-                take
-                for kind, take in holdings.takes
-                if kind != CONSENT and subject_of(take) == subject
-            }
-        )
+        takes = {
+            take
+            for kind, take in holdings.takes
+            if kind != CONSENT and subject_of(take) == subject
+        }
         with_space = partial(_with_space, place, holdings)
+        command = "skindb withdraw"
         with ExitStack() as leases:
-            for take in takes:
-                lease = Lease(
-                    place,
-                    take,
-                    ("capture", "model"),
-                    wait=wait,
-                    command="skindb withdraw",
-                )
+            for take in sorted(takes):
+                kinds = ("capture", "model")
+                lease = Lease(place, take, kinds, wait=wait, command=command)
                 with_space(partial(leases.enter_context, lease))
             with_space(partial(mark_withdrawn, place, subject, holdings.counts))
         note_withdrawals(place, is_repeated=True)
@@ -273,7 +272,7 @@ def _erase_holdings(
             with_space(partial(write_request, place, changed))
     prepare = partial(_before_removal, place, holdings, markers, erasure)
     for record in holdings.versions:
-        if _key(record) in holdings.current:
+        if record.seal in holdings.current:
             with_space(partial(prepare, record))
     for record in holdings.versions:
         with_space(partial(_remove_record, place, record))
@@ -330,57 +329,36 @@ def _doomed(records: Iterable[Record], markers: Markers) -> list[Record]:
     subjects that is removed, it is stale.
     """
     listed = list(records)
-    refused = {_key(record) for record in listed if not markers.admits(record)}
+    refused = {record.seal for record in listed if not markers.admits(record)}
     affected = set(refused)
     while (
-        added := {
-            _key(version)
-            for version in listed
-            if any(_input_key(reference) in affected for reference in version.made_from)
-        }
+        added := {version.seal for version in listed if _uses(version, affected)}
         - affected
     ):
         affected |= added
+    kept = (*KINDS_OF_ONE_SUBJECT, RELEASE)
     doomed = [
         record
         for record in listed
-        if _key(record) in affected and _is_removed(record, refused, markers)
+        if record.seal in affected
+        and not markers.hides(record.kind, record.take)
+        and (record.seal in refused or record.kind not in kept)
     ]
-    gone = {_key(record) for record in doomed}
+    gone = {record.seal for record in doomed}
     # a release holds no data: it only names versions, and those that remain do it no harm
     doomed += [
         record
         for record in listed
-        if record.kind == RELEASE
-        and _key(record) not in refused
-        and any(_input_key(reference) in gone for reference in record.made_from)
+        if record.kind == RELEASE and record.seal not in refused and _uses(record, gone)
     ]
     return sorted(
         doomed, key=lambda record: (_rank(record.kind), record.take, record.generation)
     )
 
 
-def _is_removed(record: Record, refused: set[Key], markers: Markers) -> bool:
-    """Whether an affected version is removed by itself, not with its take."""
-    if markers.hides(record.kind, record.take):
-        return False
-    return _key(record) in refused or record.kind not in (
-        *KINDS_OF_ONE_SUBJECT,
-        RELEASE,
-    )
-
-
-def _own_takes(place: Place, markers: Markers) -> list[tuple[str, str]]:
-    """Kind and take of everything of withdrawn subjects, including unfinished versions
-    and leases.
-    """
-    takes = {
-        (kind, take)
-        for top in FOLDERS_WITH_TAKES
-        for kind, take in takes_below(place, top)
-        if markers.hides(kind, take)
-    }
-    return sorted(takes, key=lambda key: (_rank(key[0]), key))
+def _uses(record: Record, seals: set[str]) -> bool:
+    """Whether one of these versions is an input of a version."""
+    return any(reference["seal"] in seals for reference in record.made_from)
 
 
 def _unrecorded(
@@ -403,16 +381,16 @@ def _unrecorded(
             for name in place.children(f"data/{kind}/{take}")
             if (match := STEM.match(name))
         }
-        unnamed = [
-            path
-            for stem in sorted(stems)
-            if (path := f"data/{kind}/{take}/{stem}.zarr") not in named
-        ]
-        refused = [
-            path
-            for path in unnamed
-            if not _is_admitted(place, markers, path, subjects_of(kind, take, ()))
-        ]
+        refused = []
+        for stem in sorted(stems):
+            path = f"data/{kind}/{take}/{stem}.zarr"
+            if path in named:
+                continue
+            names = read_names(place, path)
+            if names is None or any(
+                map(markers.is_withdrawn, subjects_of(kind, take, names))
+            ):
+                refused.append(path)
         if refused:
             log = Log(place, kind, take)
             readable = {record.generation for record in log.readable()}
@@ -425,48 +403,40 @@ def _unrecorded(
     return paths, damaged
 
 
-def _is_admitted(place: Place, markers: Markers, path: str, subjects: set[str]) -> bool:
-    """Whether an unfinished version is known to refer to no withdrawn subject beside its own."""
-    names = read_names(place, path)
-    if names is None:
-        return False
-    return not any(map(markers.is_withdrawn, subjects.union(map(subject_of, names))))
-
-
 def _before_removal(
     place: Place, holdings: Holdings, markers: Markers, erasure: Erasure, record: Record
 ) -> None:
     """Prepare the replacement of the newest version of a kind and take that is to be removed."""
-    gone = {_key(version) for version in holdings.versions}
+    gone = {version.seal for version in holdings.versions}
     request = _replacement(record, gone)
-    changed = None if request is None else request.without(markers.is_withdrawn)
-    if request is not None and changed is None:
+    if request is None:
+        return
+    changed = request.without(markers.is_withdrawn)
+    if changed is None:
         erasure.lost.append(f"{request}: no other take was used")
-    elif changed is not None and record.kind == RELEASE:
+    elif record.kind == RELEASE:
         _revise(place, changed, erasure)
-    elif changed is not None:
+    else:
         write_request(place, changed)
 
 
-def _replacement(record: Record, gone: set[Key]) -> Request | None:
+def _replacement(record: Record, gone: set[str]) -> Request | None:
     """The request to compute a result again; None for kinds that are not computed by themselves."""
     parameters = dict(record.provenance.get("parameters", {}))
     if record.kind == RELEASE:
-        pins = [pin for pin in record.made_from if _input_key(pin) not in gone]
+        pins = [pin for pin in record.made_from if pin["seal"] not in gone]
         takes = {pin["take"] for pin in pins}
         lacking = [
             pin["take"]
             for pin in record.made_from
-            if _input_key(pin) in gone and pin["take"] in takes
+            if pin["seal"] in gone and pin["take"] in takes
         ]
         return Request(RELEASE, record.take, {TAKES: lacking, PINS: pins})
     if record.kind == REGISTRATION:
         return Request(REGISTRATION, "", {"reference": parameters.get("reference", "")})
-    return (
-        Request(record.kind, record.take, parameters)
-        if record.kind in (STUDY, "edit")
-        else None
-    )
+    if record.kind in (STUDY, "edit"):
+        return Request(record.kind, record.take, parameters)
+    return None
 
 
 def _revise(place: Place, request: Request, erasure: Erasure) -> None:
@@ -502,14 +472,6 @@ def _with_space(place: Place, holdings: Holdings, step: Callable[[], T]) -> T:
     for record in holdings.versions:
         place.remove(record.path)
     return step()
-
-
-def _key(record: Record) -> Key:
-    return record.kind, record.take, record.seal
-
-
-def _input_key(reference: dict[str, str]) -> Key:
-    return reference["kind"], reference["take"], reference["seal"]
 
 
 def _rank(kind: str) -> int:

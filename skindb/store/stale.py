@@ -122,38 +122,32 @@ class Staleness:
     def _input_reasons(
         self, record: Record, one: Mapping[str, Any]
     ) -> Iterator[Reason]:
-        kind = str(one["kind"])
-        take = str(one["take"])
-        generation = int(one["generation"])
+        kind, take, generation = key = one["kind"], one["take"], one["generation"]
         try:
-            made_from = self._records(kind).record(kind, take, generation)
+            made_from = self._records(kind).record(*key)
         except UnavailableError:
             raise
-        except WithdrawnError:
-            made_from = None
-        except InputError:
-            if generation in Log(self._snapshot.place, kind, take).generations():
-                yield Reason("unreadable", kind, take, generation)
-                return
-            made_from = None
-        if made_from is None or one["seal"] != made_from.seal:
-            yield Reason("withdrawn", kind, take, generation)
+        except InputError as error:
+            listed = Log(self._snapshot.place, kind, take).generations()
+            is_damaged = generation in listed and not isinstance(error, WithdrawnError)
+            yield Reason("unreadable" if is_damaged else "withdrawn", *key)
+            return
+        if one["seal"] != made_from.seal:
+            yield Reason("withdrawn", *key)
             return
         if (
             record.kind in KINDS_OF_MANY_SUBJECTS
             and kind != STUDY
             and not self._is_covered(take)
         ):
-            yield Reason("not covered", kind, take, generation)
-        if not _is_of_release(record) and self._newest_of(kind, take) > generation:
-            yield Reason("superseded", kind, take, generation)
+            yield Reason("not covered", *key)
+        is_of_release = record.provenance.get("parameters", {}).get("release")
+        if not is_of_release and self._newest_of(kind, take) > generation:
+            yield Reason("superseded", *key)
         if kind in DERIVED:
-            inherited = self.reasons(made_from)
-            yield from (
-                one
-                for one in inherited
-                if not (_is_of_release(record) and one.why == "superseded")
-            )
+            for reason in self.reasons(made_from):
+                if not (is_of_release and reason.why == "superseded"):
+                    yield reason
 
     def _find_cover(self, take: str) -> bool:
         """Whether the consent of the subject of a take covers statistics; False if it is
@@ -191,11 +185,8 @@ def require_fresh(db: Located, kind: str, take: str) -> None:
     reasons = Staleness(db).reasons(record)
     if refused := [reason for reason in reasons if reason.why != "superseded"]:
         rule = "its inputs must exist and be covered by consent"
-        cure = (
-            CURE_DAMAGE
-            if any(reason.why == "unreadable" for reason in refused)
-            else CURE
-        )
+        is_damaged = any(reason.why == "unreadable" for reason in refused)
+        cure = CURE_DAMAGE if is_damaged else CURE
         raise InputError(
             Fault(title, rule, finding, cure)
             for finding in dict.fromkeys(map(str, refused))
@@ -234,10 +225,6 @@ def stale_versions(db: Located) -> list[tuple[Record, tuple[Reason, ...]]]:
     ]
 
 
-def _is_of_release(record: Record) -> bool:
-    return bool(record.provenance.get("parameters", {}).get("release"))
-
-
 @dataclass(frozen=True)
 class Request:
     """A result that is to be computed again."""
@@ -259,41 +246,35 @@ class Request:
         """The request without takes of withdrawn subjects; None if nothing remains to
         be computed.
         """
-        if self.kind not in KINDS_WITHOUT_SUBJECT and is_withdrawn(
-            subject_of(self.take)
-        ):
+
+        def remains(take: str) -> bool:
+            return not is_withdrawn(subject_of(take))
+
+        if self.kind not in KINDS_WITHOUT_SUBJECT and not remains(self.take):
             return None
         parameters = dict(self.parameters)
-        takes = parameters.get(TAKES)
-        if takes:
-            parameters[TAKES] = [
-                take for take in takes if not is_withdrawn(subject_of(take))
-            ]
+        if parameters.get(TAKES):
+            parameters[TAKES] = [*filter(remains, parameters[TAKES])]
             # an empty list would mean all takes
             if not parameters[TAKES] and not parameters.get(PINS):
                 return None
         if PINS in parameters:
-            parameters[PINS] = [
-                pin
-                for pin in parameters[PINS]
-                if not is_withdrawn(subject_of(pin["take"]))
-            ]
-            if not any(pin["kind"] == "model" for pin in parameters[PINS]):
+            pins = [pin for pin in parameters[PINS] if remains(pin["take"])]
+            parameters[PINS] = pins
+            if not any(pin["kind"] == "model" for pin in pins):
                 return None
-        reference = parameters.get(REFERENCE)
-        if reference and is_withdrawn(subject_of(reference)):
+        if not remains(parameters.get(REFERENCE) or ""):
             parameters[REFERENCE] = ""
         return Request(self.kind, self.take, parameters)
+
+    def content(self) -> bytes:
+        """Content of its file."""
+        return sealed(asdict(self))
 
 
 def write_request(place: Place, request: Request) -> None:
     """Write a request durably; it replaces one for the same result."""
-    place.replace(request.key, request_content(request))
-
-
-def request_content(request: Request) -> bytes:
-    """Content of the file of a request."""
-    return sealed(asdict(request))
+    place.replace(request.key, request.content())
 
 
 def read_requests(place: Place) -> tuple[list[Request], list[Fault]]:
@@ -305,7 +286,8 @@ def read_requests(place: Place) -> tuple[list[Request], list[Fault]]:
             continue
         key = f"{REQUESTS}/{name}"
         request = attempt(faults, partial(_read_request, place, key))
-        requests += [] if request is None else [request]
+        if request is not None:
+            requests.append(request)
     return requests, faults
 
 
