@@ -17,7 +17,6 @@ from typing import TypeVar
 from skindb import __version__
 from skindb.clock import utc_time
 from skindb.errors import Fault, input_error, require, require_none
-from skindb.schema.consent import CONSENT
 from skindb.store.archive import (
     RECORD_KEY,
     STATE_KEY,
@@ -120,10 +119,19 @@ def erase_from_archive(place: Place, archive: Archive, *, wait: float = 0.0) -> 
         writes to it.
     """
     archive.require()
+    command = "skindb withdraw"
     with Lease(
-        archive.place, "backup", (RELEASE,), wait=wait, command="skindb withdraw"
+        archive.place, "backup", (RELEASE,), wait=wait, command=command
     ) as lease:
-        return _repeated(lambda: _erase(place, archive, lease), place)
+
+        def erase() -> int:
+            markers = archive.adopt(place)
+            contents = archive.contents()
+            states, faults = _erased_states(archive, markers)
+            require_none(faults)
+            return archive.prune(contents, _needed(archive, states), lease)
+
+        return _repeated(erase, place)
 
 
 def verify_archive(archive: Archive) -> list[Fault]:
@@ -133,13 +141,10 @@ def verify_archive(archive: Archive) -> list[Fault]:
     checked: set[str] = set()
     seen: set[str] = set()
     for state in states:
-        fresh = {
-            item[1]: item
-            for item in archive.uses(state, seen, faults)
-            if item[1] not in checked
-        }
-        checked |= fresh.keys()
-        intact(partial(archive.parsed, bool), fresh.values(), faults)
+        items = {item[1]: item for item in archive.uses(state, seen, faults)}
+        fresh = [items[digest] for digest in items.keys() - checked]
+        checked |= items.keys()
+        intact(partial(archive.parsed, bool), fresh, faults)
     return list(dict.fromkeys(faults))
 
 
@@ -186,14 +191,6 @@ def _begin(place: Place, archive: Archive) -> None:
     archive.require()
 
 
-def _erase(place: Place, archive: Archive, lease: Lease) -> int:
-    markers = archive.adopt(place)
-    contents = archive.contents()
-    states, faults = _erased_states(archive, markers)
-    require_none(faults)
-    return archive.prune(contents, _needed(archive, states), lease)
-
-
 def _write_state(place: Place, archive: Archive, lease: Lease) -> BackupReport:
     markers = archive.adopt(place)
     guard = archive.guard(markers)
@@ -201,9 +198,7 @@ def _write_state(place: Place, archive: Archive, lease: Lease) -> BackupReport:
     states, faults = _erased_states(archive, markers)
     draft = _draft(place, markers)
     note_withdrawals(place)
-    note_consents(
-        place, [record for record in draft.records.values() if record.kind == CONSENT]
-    )
+    note_consents(place, draft.records.values())
     lease.require()
     digests = {digest for _, digest, _ in draft.items} | draft.additions.keys()
     removed = 0
@@ -212,12 +207,8 @@ def _write_state(place: Place, archive: Archive, lease: Lease) -> BackupReport:
     stored = archive.contents()
     missing = {item[1]: item for item in draft.items if item[1] not in stored}
     faults += draft.faults
-    sizes = [
-        size
-        for _, size in intact(
-            partial(_copy, place, archive, guard), missing.values(), faults
-        )
-    ]
+    copy = partial(_copy, place, archive, guard)
+    sizes = [size for _, size in intact(copy, missing.values(), faults)]
     for digest, content in draft.additions.items():
         archive.put(content, digest, guard)
     state = State(
@@ -232,15 +223,14 @@ def _write_state(place: Place, archive: Archive, lease: Lease) -> BackupReport:
     lease.require()
     if not archive.place.create(state.key, state.content(), guard=guard):
         raise Changed
-    present = len(digests & stored)
     return BackupReport(
         state.number,
         state.versions,
-        len(sizes),
-        present,
-        sum(sizes),
-        removed,
-        tuple(faults),
+        copied=len(sizes),
+        present=len(digests & stored),
+        bytes=sum(sizes),
+        removed=removed,
+        faults=tuple(faults),
     )
 
 
@@ -262,8 +252,9 @@ def _erased_states(
     """
     states, faults = archive.states()
     guard = archive.guard(markers)
+    withdrawals = seal_of_withdrawals(markers)
     for number, state in enumerate(states):
-        if state.withdrawals == seal_of_withdrawals(markers):
+        if state.withdrawals == withdrawals:
             continue
         tombstones = [key for key in state.files if key.startswith("tombstones/")]
         remaining, additions = surviving(
@@ -279,7 +270,7 @@ def _erased_states(
             state,
             files=files,
             versions=len(remaining),
-            withdrawals=seal_of_withdrawals(markers),
+            withdrawals=withdrawals,
         )
         archive.place.replace(state.key, changed.content(), guard=guard)
         states[number] = changed
@@ -331,8 +322,7 @@ def _list_twice(place: Place) -> Listing:
     """
     before = _list(place)
     for _ in range(MAX_LISTS):
-        listing = _list(place)
-        if listing == before:
+        if (listing := _list(place)) == before:
             return listing
         before = listing
     raise input_error(

@@ -10,7 +10,6 @@ same.
 import gc
 import hashlib
 import json
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -138,20 +137,19 @@ def unpacked(key: str, content: bytes) -> bytes:
 
 
 def read_blocks(place: Place) -> dict[str, list[Entry] | None]:
-    """Key of every block of the catalogue -> its entries; None if it is damaged."""
-    blocks = read_cache(place, CATALOGUE, partial(_read_block, place))
-    pattern = f"{CATALOGUE}/{CATALOGUE_BLOCK}"
-    return {key: block for key, block in blocks.items() if re.fullmatch(pattern, key)}
+    """Key of every file in the folder of the catalogue -> its entries; None if it is
+    damaged or foreign.
+    """
+    return read_cache(place, CATALOGUE, partial(_read_block, place))
 
 
 def catalogue_blocks_of(place: Place, is_named: Callable[[str], bool]) -> list[str]:
     """Blocks, and foreign files beside them, that may name a subject for whom `is_named`
     is true.
     """
-    blocks = read_cache(place, CATALOGUE, partial(_read_block, place))
     return [
         key
-        for key, entries in blocks.items()
+        for key, entries in read_blocks(place).items()
         if entries is None
         or any(is_named(name) for entry in entries for name in entry.record.subjects)
     ]

@@ -64,12 +64,11 @@ class Claim:
     def seconds(self) -> float:
         """Duration of the lease after the file was written."""
         value = self.body.get("seconds")
-        usable = (
-            isinstance(value, int | float)
-            and not isinstance(value, bool)
-            and 0 < value <= MAX_LEASE_SECONDS
-        )
-        return float(value) if usable else LEASE_SECONDS  # type: ignore[arg-type]
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            return LEASE_SECONDS
+        if 0 < value <= MAX_LEASE_SECONDS:
+            return float(value)
+        return LEASE_SECONDS
 
     @property
     def is_released(self) -> bool:
@@ -216,8 +215,15 @@ class Lease:
         """
         for key in self._held:
             newest = _newest(self.place, key)
-            if newest is None or newest.body.get("token") != self.token:
-                self._lost = self._lost or _lost_fault(key, newest)
+            if self._lost or (newest and newest.body.get("token") == self.token):
+                continue
+            finding = "another run took over, because this one did not renew its lease"
+            if newest is None:
+                finding = "the lease was removed"
+            elif not newest.is_released:
+                finding += f": {newest}"
+            cure = "nothing was committed; run the command again"
+            self._lost = Fault(_lease_name(key), ONE_RUN, finding, cure)
         if self._lost:
             raise LeaseLost(self._lost)
 
@@ -267,17 +273,16 @@ class Lease:
         with suppress(OSError, InputError):  # otherwise the lease expires
             for key, number in self._held.items():
                 newest = _newest(self.place, key)
-                if newest is not None and newest.body.get("token") == self.token:
-                    self._free(_file_key(key, number), content)
+                if newest is None or newest.body.get("token") != self.token:
+                    continue
+                file = _file_key(key, number)
+                try:
+                    self.place.replace(file, content, guard=self._guard)
+                except OSError:
+                    # the disk may be full; without its file the lease is free, even
+                    # while this process continues
+                    self.place.remove(file)
         self._held.clear()
-
-    def _free(self, key: str, content: bytes) -> None:
-        try:
-            self.place.replace(key, content, guard=self._guard)
-        except OSError:
-            # the disk may be full; without its file the lease is free, even while this
-            # process continues
-            self.place.remove(key)
 
 
 def holder_of(place: Place, kind: str, take: str) -> str:
@@ -291,10 +296,9 @@ def abandoned_holder(place: Place, kind: str, take: str) -> str:
     lease or still holds it.
     """
     newest = _newest(place, f"leases/{kind}/{take}")
-    is_abandoned = (
-        newest is not None and not newest.is_released and _has_ended(place, newest)
-    )
-    return str(newest) if is_abandoned else ""
+    if newest is None or newest.is_released or not _has_ended(place, newest):
+        return ""
+    return str(newest)
 
 
 def _has_ended(place: Place, claim: Claim) -> bool:
@@ -352,31 +356,13 @@ def _lease_name(key: str) -> str:
     return f"{kind} of {take}"
 
 
-def _lost_fault(key: str, newest: Claim | None) -> Fault:
-    finding = "another run took over, because this one did not renew its lease"
-    if newest is None:
-        finding = "the lease was removed"
-    elif not newest.is_released:
-        finding += f": {newest}"
-    return Fault(
-        _lease_name(key),
-        ONE_RUN,
-        finding,
-        "nothing was committed; run the command again",
-    )
-
-
 def this_process() -> Json:
     """Host name, process id and, on Linux, the boot id, the namespace of process ids
     and the start time.
     """
     number = os.getpid()
-    return {
-        "host": socket.gethostname(),
-        "process": number,
-        "started": _start(number),
-        **_machine(),
-    }
+    names = {"host": socket.gethostname(), "process": number, "started": _start(number)}
+    return names | _machine()
 
 
 def has_ended(holder: Attributes) -> bool:
@@ -385,9 +371,9 @@ def has_ended(holder: Attributes) -> bool:
     """
     number = holder.get("process")
     started = holder.get("started")
-    if not _is_here(holder):
+    if not _is_here(holder) or not started:
         return False
-    if not isinstance(number, int) or not 0 < number < 1 << 31 or not started:
+    if not isinstance(number, int) or not 0 < number < 1 << 31:
         return False
     try:
         os.kill(number, 0)
@@ -417,9 +403,8 @@ def _start(number: int) -> str | None:
     None if unknown.
     """
     try:
-        state, *rest = (
-            (PROC / str(number) / "stat").read_text().rpartition(")")[2].split()
-        )
+        status = (PROC / f"{number}/stat").read_text()
+        state, *rest = status.rpartition(")")[2].split()
     except (OSError, ValueError):
         return None
     return "ended" if state in "ZX" else rest[18]

@@ -54,7 +54,7 @@ from skindb.errors import (
 )
 from skindb.files import Attributes, Json, make_private, private_file, read_regular
 from skindb.limits import MAX_STORE_JSON_BYTES
-from skindb.schema.consent import consent_scope
+from skindb.schema.consent import CONSENT, consent_scope
 from skindb.store.folder import flush_path
 from skindb.store.place import AUDIT, Place
 from skindb.store.record import (
@@ -133,8 +133,7 @@ class WithdrawalGuard:
             "the subject must not be withdrawn while a version with its data is written"
         )
         cure = "nothing was committed; run the command again without the subject"
-        faults = [Fault(one, rule, "a withdrawal", cure) for one in withdrawn]
-        if faults:
+        if faults := [Fault(one, rule, "a withdrawal", cure) for one in withdrawn]:
             raise WithdrawnError(faults)
 
 
@@ -183,10 +182,10 @@ def mark_withdrawn(place: Place, subject: str, removed: Mapping[str, int]) -> No
 
 def marker_faults(place: Place) -> list[Fault]:
     """Faults of the secret and of the entries."""
+    faults: list[Fault] = []
     hashes = _hashes(place)
     if not hashes and not place.file_type(SECRET):
-        return []
-    faults: list[Fault] = []
+        return faults
     secret = attempt(faults, partial(require_secret, place))
     if secret is not None:
         for name in sorted(hashes):
@@ -298,14 +297,14 @@ def note_withdrawals(place: Place, *, is_repeated: bool = False) -> None:
 
 
 def note_consents(place: Place, records: Iterable[Record]) -> None:
-    """Add records of consent to the marker file of their database, which is created if
-    it is missing.
+    """Add the records of consent among these to the marker file of their database, which
+    is created if it is missing.
     """
 
     def add(notes: Notes, secret: bytes) -> None:
         for record in records:
             name = keyed_hash(secret, record.seal)
-            if name not in notes.records:
+            if record.kind == CONSENT and name not in notes.records:
                 notes.records.append(name)
                 notes.consents[keyed_hash(secret, record.take)] = {
                     "consent": list(consent_scope(record.provenance)),

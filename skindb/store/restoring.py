@@ -159,8 +159,7 @@ def _write(archive: Archive, place: Place, plan: Plan) -> tuple[int, list[Record
         place.remove(LOCK)
     place.is_unlocked = False
     note_withdrawals(place)
-    restored = [record for record in plan.records.values() if record.kind == CONSENT]
-    note_consents(place, [*consents, *restored])
+    note_consents(place, [*consents, *plan.records.values()])
     return written, consents
 
 
@@ -227,18 +226,10 @@ def _require_empty(place: Place) -> None:
 
 
 def _copy_all(archive: Archive, place: Place, plan: Plan) -> int:
-    """Copy all files; returns the number of their bytes."""
-    _remove_left(place)
-    copied = intact(partial(_copy, archive, place), plan.items, plan.faults)
-    written = sum(size for _, size in copied)
-    for key, content in plan.texts.items():
-        place.create(key, content)
-    return written
+    """Copy all files; returns the number of their bytes.
 
-
-def _remove_left(place: Place) -> None:
-    """Remove everything that an interrupted restore has written: it may be of a subject
-    who was withdrawn since.
+    Everything that an interrupted restore has written is removed first: it may be of a
+    subject who was withdrawn since.
     """
     place.sweep()
     for name in place.children(WITHDRAWN):
@@ -247,6 +238,11 @@ def _remove_left(place: Place) -> None:
     for top in place.names() or []:
         if top not in OF_A_RESTORE:
             place.remove(top)
+    copied = intact(partial(_copy, archive, place), plan.items, plan.faults)
+    written = sum(size for _, size in copied)
+    for key, content in plan.texts.items():
+        place.create(key, content)
+    return written
 
 
 def _copy(archive: Archive, place: Place, item: Item) -> int:
@@ -258,12 +254,11 @@ def _copy(archive: Archive, place: Place, item: Item) -> int:
 
 def _subjects(plan: Plan) -> dict[str, str]:
     """Keyed hash of every subject of the restored versions -> pseudonym."""
-    subjects = {
-        subject
+    return {
+        keyed_hash(plan.markers.secret, subject): subject
         for record in plan.records.values()
         for subject in subjects_of(record.kind, record.take, ())
     }
-    return {keyed_hash(plan.markers.secret, subject): subject for subject in subjects}
 
 
 def _repeat_consents(place: Place, plan: Plan) -> list[Record]:
@@ -277,12 +272,12 @@ def _repeat_consents(place: Place, plan: Plan) -> list[Record]:
     records = []
     for name, consent in sorted(plan.notes.consents.items()):
         if name in subjects and consent["record"] not in seals:
-            subject = subjects[name]
-            with Stage(place, CONSENT, subject) as stage:
-                scope = {"subject": subject, "consent_scope": consent["consent"]}
-                records.append(
-                    stage.commit(
-                        scope | {"command": "restore", "recorded": consent["created"]}
-                    )
-                )
+            provenance = {
+                "subject": subjects[name],
+                "consent_scope": consent["consent"],
+                "command": "restore",
+                "recorded": consent["created"],
+            }
+            with Stage(place, CONSENT, subjects[name]) as stage:
+                records.append(stage.commit(provenance))
     return records

@@ -12,6 +12,7 @@ from bisect import insort
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from functools import partial
+from itertools import chain
 from typing import Any
 
 from skindb.errors import Fault, InputError, input_error, require
@@ -52,13 +53,11 @@ class Snapshot:
     ----------
     place
         Location of the database.
-    markers
-        The withdrawals; default those of now.
     """
 
-    def __init__(self, place: Place, markers: Markers | None = None) -> None:
+    def __init__(self, place: Place) -> None:
         self.place = place
-        self.markers = read_markers(place) if markers is None else markers
+        self.markers = read_markers(place)
 
     def kinds(self, take: str | None = None) -> list[str]:
         """Kinds of the versions of one take or of all takes."""
@@ -173,9 +172,11 @@ class Lookup:
     def takes(self, kind: str) -> frozenset[str]:
         """Takes with a version of this kind."""
         if kind not in self._takes:
-            names = self._source.takes(kind)
-            if self._is_pinned(kind):
-                names = [take for pinned, take in self._pins or () if pinned == kind]
+            names = (
+                [take for pinned, take in self._pins or () if pinned == kind]
+                if self._is_pinned(kind)
+                else self._source.takes(kind)
+            )
             self._takes[kind] = frozenset(names)
         return self._takes[kind]
 
@@ -200,11 +201,11 @@ class Lookup:
         """The newest record of a take, or that of the release."""
         key = (kind, take)
         if key not in self._records:
-            if self._pins and self._is_pinned(kind):
-                record = pinned_record(self._source, self._pins, kind, take)
-            else:
-                record = self._source.record(kind, take)
-            self._records[key] = record
+            self._records[key] = (
+                pinned_record(self._source, self._pins, kind, take)
+                if self._pins and self._is_pinned(kind)
+                else self._source.record(kind, take)
+            )
         return self._records[key]
 
     def history(self, kind: str, take: str) -> list[Record]:
@@ -314,11 +315,15 @@ class RecordCache:
         self._files = list_records(place)
         self._heads = _list_heads(place)
         blocks = read_blocks(place)
-        self._markers = read_markers(place)
-        self.snapshot = Snapshot(place, self._markers)
+        self.snapshot = Snapshot(place)
+        self._markers = self.snapshot.markers
         self._entries: dict[Key, Entry] = {}
-        for entries in blocks.values():
-            self._add_entries(entries or ())
+        for entry in chain(*filter(None, blocks.values())):  # if its files are the same
+            key = entry.record.key
+            if self._files.get(key) == entry.file:
+                head = self._heads.get(key[:2], "")
+                if key not in self._entries or entry.head == head:
+                    self._entries[key] = entry
         self._new: set[Key] = set()  # entries that no block holds
         # kind and take -> generations in ascending order
         self._generations: dict[tuple[str, str], list[int]] = {}
@@ -327,15 +332,6 @@ class RecordCache:
         self._named: dict[str, set[str]] = {}  # kind -> takes with a record or a head
         for kind, take in (*self._generations, *self._heads):
             self._named.setdefault(kind, set()).add(take)
-
-    def _add_entries(self, entries: Iterable[Entry]) -> None:
-        """Add the entries of a block whose files have not changed."""
-        for entry in entries:
-            key = entry.record.key
-            if self._files.get(key) == entry.file:
-                head = self._heads.get(key[:2], "")
-                if key not in self._entries or entry.head == head:
-                    self._entries[key] = entry
 
     def kinds(self) -> list[str]:
         """Kinds of the versions of all takes."""
@@ -422,8 +418,7 @@ class RecordCache:
 
     def _read(self, kind: str, take: str, generation: int | None) -> Record:
         """A record from the log, with the checks of `Log.read`."""
-        record = self.snapshot.record(kind, take, generation)
-        record = trimmed_record(record)
+        record = trimmed_record(self.snapshot.record(kind, take, generation))
         key = record.key
         if key in self._files:
             head = self._heads.get(key[:2], "") if generation is None else None
