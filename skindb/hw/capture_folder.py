@@ -24,7 +24,7 @@ from skindb.errors import (
     require,
     require_none,
 )
-from skindb.files import make_private, private_file
+from skindb.files import Json, make_private, private_file
 from skindb.format.dome import CameraRecord, DomeRecord
 from skindb.format.fields import Fields, read_json
 from skindb.format.frames import (
@@ -67,9 +67,8 @@ class Unfinished:
         before has no subject.
         """
         recorded = self.sequence or self.sites or self.flashes_per_second
-        return bool(recorded) or any(
-            (self.folder / name).exists() for name in ("dome", "contact")
-        )
+        folders = (self.folder / name for name in ("dome", "contact"))
+        return bool(recorded) or any(folder.exists() for folder in folders)
 
     def save(self) -> None:
         """Replace the file atomically, so that a killed process leaves the old or the
@@ -351,11 +350,8 @@ def keep_site(session: Unfinished, run: SiteRun, number: int) -> None:
     """Copy the frames of one placement of the probe, and record it in `unfinished.json`."""
     suffix = next(iter(run.frames.values())).suffix
     for exposure, path in run.frames.items():
-        copy_frame(
-            path,
-            session.folder
-            / f"{SITE_FRAMES.format(site=run.site, exposure=exposure, placement=number)}{suffix}",
-        )
+        name = SITE_FRAMES.format(site=run.site, exposure=exposure, placement=number)
+        copy_frame(path, session.folder / f"{name}{suffix}")
     entry = {
         "site": run.site,
         "number": number,
@@ -482,27 +478,20 @@ def capture_record(subject: Subject) -> dict[str, Any]:
 
 
 def _write_probe(session: Unfinished, probe: Mapping[str, Any]) -> None:
-    sites = dict.fromkeys(str(entry["site"]) for entry in session.sites)
-    placements = {
-        site: [entry for entry in session.sites if entry["site"] == site]
-        for site in sites
-    }
+    placements: dict[str, Json] = {}  # site -> number -> log of the pressure
+    for entry in session.sites:
+        numbers = placements.setdefault(str(entry["site"]), {})
+        numbers[str(entry["number"])] = entry["pressure"]
     record = {
         key: value
         for key, value in probe.items()
         if key not in ("frames", "sites", "pressure", "placements")
     }
     record |= {
-        "sites": list(sites),
+        "sites": list(placements),
         "frames": f"{SITE_FRAMES}{session.sites[0]['suffix']}",
-        "placements": {
-            site: [str(entry["number"]) for entry in entries]
-            for site, entries in placements.items()
-        },
-        "pressure": {
-            site: {str(entry["number"]): entry["pressure"] for entry in entries}
-            for site, entries in placements.items()
-        },
+        "placements": {site: list(numbers) for site, numbers in placements.items()},
+        "pressure": placements,
     }
     write_record(session.folder / "contact/probe.json", record)
 

@@ -3,7 +3,8 @@ page that needs no hands. Lights flash at most three times in a second.
 """
 
 from collections.abc import Mapping, Sequence
-from itertools import cycle, pairwise
+from dataclasses import replace
+from itertools import cycle, islice, pairwise
 
 import numpy as np
 
@@ -41,6 +42,7 @@ from skindb.hw.link import (
     Port,
     Range,
     checksum,
+    text_of,
 )
 from skindb.hw.probe import KIND as PROBE
 from skindb.hw.sequence import DARK, Schedule, Step
@@ -134,7 +136,7 @@ class _Device:
         is_right = reply.verb == OK or (
             reply.verb == ERROR and reply.values.get("text")
         )
-        self.expect(is_right, "must reply OK, or ERR with a text", _found(reply))
+        self.expect(is_right, "must reply OK, or ERR with a text", reply)
         size = 0 if "lights" in reply.values else len(reply.encode())
         rule = f"replies need at most {MAX_REPLY_BYTES} bytes, unless they list lights"
         self.expect(size <= MAX_REPLY_BYTES, rule, f"{size} bytes")
@@ -147,26 +149,31 @@ class _Device:
     def accepts(self, verb: str, **values: object) -> Message:
         """The reply to a request that must be accepted."""
         reply = self.ask(verb, **values)
-        self.expect(
-            reply.verb == OK, f"must accept {_text(verb, values)}", _found(reply)
-        )
+        self.expect(reply.verb == OK, f"must accept {text_of(verb, values)}", reply)
         return reply
 
     def refuses(self, why: str, verb: str, **values: object) -> None:
         """A request that must be refused, with a reason."""
         reply = self.ask(verb, **values)
-        rule = f"must refuse {_text(verb, values)} ({why}) by ERR with a text"
-        self.expect(reply.verb == ERROR, rule, _found(reply))
+        rule = f"must refuse {text_of(verb, values)} ({why}) by ERR with a text"
+        self.expect(reply.verb == ERROR, rule, reply)
+
+    def keep_alive(self, why: str, verb: str, values: Mapping[str, object]) -> None:
+        """A request, refused if there is a reason; any of them resets the watchdog."""
+        if why:
+            self.refuses(why, verb, **values)
+        else:
+            self.accepts(verb, **values)
 
     def repeats(self, line: bytes) -> None:
         """A line, and again after a while, which must only be answered again."""
         first = self.send(line)
         rule = f"must accept {line.split(b'*')[0].decode()}"
-        self.expect(first.verb == OK, rule, _found(first))
+        self.expect(first.verb == OK, rule, first)
         self.pace(PACE)
         second = self.send(line)
         rule = "must send its last reply again to the same line"
-        self.expect(first == second, rule, f"{_found(first)}; {_found(second)}")
+        self.expect(first == second, rule, f"{first}; {second}")
 
     def value(self, reply: Message, name: str, accepted: Accepted[object]) -> float:
         """A number of a reply or an event; NaN if it is not one of these."""
@@ -186,14 +193,6 @@ class _Device:
         self.accepts("BEAT")
 
 
-def _text(verb: str, values: dict[str, object]) -> str:
-    return " ".join([verb, *(f"{name}={value}" for name, value in values.items())])
-
-
-def _found(reply: Message) -> str:
-    return _text(reply.verb, dict(reply.values))
-
-
 def check_device(port: Port, *, clock: Clock = SYSTEM_CLOCK) -> tuple[str, list[Fault]]:
     """Kind of a device ("dome", "probe" or "" for another), and what it does otherwise than
     docs/protocol.md.
@@ -205,14 +204,10 @@ def check_device(port: Port, *, clock: Clock = SYSTEM_CLOCK) -> tuple[str, list[
         hello = device.ask("HELLO")
     kind = hello.values.get("kind", "")
     checks = {DOME: _check_dome, PROBE: _check_probe}
-    device.expect(
-        kind in checks, "HELLO must name the kind dome or probe", _found(hello)
-    )
+    device.expect(kind in checks, "HELLO must name the kind dome or probe", hello)
     if kind in checks:
         for name in ("name", "firmware"):
-            device.expect(
-                hello.values.get(name), f"HELLO must have a {name}", _found(hello)
-            )
+            device.expect(hello.values.get(name), f"HELLO must have a {name}", hello)
         protocol = hello.values.get("protocol")
         device.expect(protocol == str(PROTOCOL), "protocol must be 1", protocol)
         device.slowest = 0.0
@@ -246,15 +241,13 @@ def _check_lines(device: _Device, kind: str) -> None:
     device.ignores(f"a line of more than {MAX_LINE_BYTES} bytes", _closed(long))
     reply = device.send(device.line("BEAT")[:-1] + b"\r\n")
     rule = "must ignore a carriage return before the newline"
-    device.expect(reply.verb == OK, rule, _found(reply))
+    device.expect(reply.verb == OK, rule, reply)
     line = device.line("BEAT")
     device.write(line[:4])
     reply = device.send(line[4:])
-    device.expect(reply.verb == OK, "must accept a line in pieces", _found(reply))
+    device.expect(reply.verb == OK, "must accept a line in pieces", reply)
     reply = device.send(device.line("BEAT"), device.line("STATUS"))
-    device.expect(
-        reply.verb == OK, "must answer lines that arrive at once", _found(reply)
-    )
+    device.expect(reply.verb == OK, "must answer lines that arrive at once", reply)
     device.refuses("unknown verb", "DANCE")
     for verb in ("PUMP", "LED") if kind == DOME else ("CLEAR", "START"):
         device.refuses("a verb of other devices", verb)
@@ -266,16 +259,13 @@ def _check_lines(device: _Device, kind: str) -> None:
 
 def _flashes(lights: list[str], count: int) -> Schedule:
     """Steps of the lights in turn, the first one dark."""
-    steps = [
-        Step(
-            DARK if i == 0 else lights[i % len(lights)],
-            EXPOSURE,
-            i * PERIOD_US,
-            i * PERIOD_US + FLASH_US,
+    names = [DARK, *islice(cycle(lights), 1, count)]
+    return Schedule(
+        tuple(
+            Step(name, EXPOSURE, i * PERIOD_US, i * PERIOD_US + FLASH_US)
+            for i, name in enumerate(names)
         )
-        for i in range(count)
-    ]
-    return Schedule(tuple(steps))
+    )
 
 
 def _upload(device: _Device, schedule: Schedule) -> None:
@@ -308,8 +298,8 @@ def _state(device: _Device, state: str, **values: object) -> Message:
     device.value(reply, "interlock", INTERLOCKS)
     expected = {"state": state} | {name: str(value) for name, value in values.items()}
     found = {name: reply.values.get(name) for name in expected}
-    rule = f"STATUS must say {_text('', dict(expected)).strip()}"
-    device.expect(found == expected and "reason" in reply.values, rule, _found(reply))
+    rule = f"STATUS must say {text_of('', dict(expected)).strip()}"
+    device.expect(found == expected and "reason" in reply.values, rule, reply)
     return reply
 
 
@@ -355,7 +345,7 @@ def _check_plan(device: _Device, lights: list[str]) -> None:
         ("times are digits", {"on": "0.5"}),
     ):
         device.refuses(why, "STEP", **(step | changed))
-    device.refuses("off is missing", "STEP", **dict(list(step.items())[:-1]))
+    device.refuses("off is missing", "STEP", **dict([*step.items()][:-1]))
     _holds(device, Schedule(()))
     device.repeats(device.line("STEP", **step))
     step |= {"index": 1, "on": FLASH_US - 1, "off": 2 * FLASH_US}
@@ -383,15 +373,15 @@ def _check_arming(device: _Device, lights: list[str]) -> None:
             Step(
                 DARK if ms in dark else lights[0],
                 EXPOSURE,
-                ms * 1000,
-                ms * 1000 + 40_000,
+                1000 * ms,
+                1000 * ms + 40_000,
             )
             for ms in sorted((*lit, *dark))
         ]
         # a digest that begins with 0
         last = steps.pop()
         ends = (
-            Schedule((*steps, Step(last.light, EXPOSURE, last.on_us, last.off_us + i)))
+            Schedule((*steps, replace(last, off_us=last.off_us + i)))
             for i in range(1000)
         )
         schedule = next(plan for plan in ends if plan.digest.startswith("0"))
@@ -459,7 +449,7 @@ def _check_run(device: _Device, schedule: Schedule) -> None:
     ends = np.array([step.off_us / 1e6 for step in schedule.steps])
     while state.values.get("state") == "running":
         device.pace(PACE)
-        _keep_alive(device, *next(due))
+        device.keep_alive(*next(due))
         device.pace(PACE)
         state = device.ask("STATUS")
         early = device.sent - begin
@@ -468,17 +458,16 @@ def _check_run(device: _Device, schedule: Schedule) -> None:
         most = int((ends * (1 - CLOCK_ERROR) - EARLY_SECONDS < late).sum())
         steps = device.value(state, "step", Count(0, len(ends)))
         rule = "step must be the number of steps that have ended"
-        device.expect(max(finished, fewest) <= steps <= most, rule, _found(state))
+        device.expect(max(finished, fewest) <= steps <= most, rule, state)
         if early > schedule.seconds + SLACK_SECONDS:
             break
         finished = int(steps)
     for _ in range(2):
         _state(device, "done", step=len(ends))
         device.accepts("STOP")  # changes nothing
-    first = [_report(device, i, step) for i, step in enumerate(schedule.steps)]
-    second = [
-        _report(device, i, step) for i, step in reversed([*enumerate(schedule.steps)])
-    ]
+    planned = list(enumerate(schedule.steps))
+    first = [_report(device, *step) for step in planned]
+    second = [_report(device, *step) for step in reversed(planned)]
     rule = "REPORT must have the same values again, in any order"
     device.expect(first == second[::-1], rule, "others")
     rule = "a step must begin after the one before"
@@ -514,21 +503,18 @@ def _report(
         (lowest <= level <= highest, f"must have a level of {lowest:g} to {highest:g}"),
         (rest <= MAX_REST, f"must leave a rest of at most {MAX_REST}"),
     ):
-        device.expect(is_right, f"step {index} of the plan {rule}", _found(reply))
+        device.expect(is_right, f"step {index} of the plan {rule}", reply)
     return on, off
 
 
 def _check_stopped(device: _Device, lights: list[str], reason: str) -> None:
     """A run that is stopped while a light is on, by the host or by the watchdog."""
-    steps = [
-        Step(light, EXPOSURE, on, off)
-        for light, on, off in (
-            (lights[0], 0, FLASH_US),
-            (lights[-1], PERIOD_US, 5 * PERIOD_US),
-            (lights[0], 6 * PERIOD_US, 7 * PERIOD_US),
-        )
-    ]
-    schedule = Schedule(tuple(steps))
+    steps = (
+        Step(lights[0], EXPOSURE, 0, FLASH_US),
+        Step(lights[-1], EXPOSURE, PERIOD_US, 5 * PERIOD_US),
+        Step(lights[0], EXPOSURE, 6 * PERIOD_US, 7 * PERIOD_US),
+    )
+    schedule = Schedule(steps)
     _upload(device, schedule)
     begin = _start(device, schedule)
     for _ in range(2):
@@ -583,7 +569,7 @@ def _check_probe(device: _Device, _hello: Message) -> None:
     requests *= 4  # any of them resets the watchdog
     for request in requests:
         device.pace(PACE)
-        _keep_alive(device, *request)
+        device.keep_alive(*request)
         device.pace(PACE)
         _exposes(device, "exposing")
     _check_readings(device, begin, settles=True)
@@ -607,7 +593,7 @@ def _check_probe(device: _Device, _hello: Message) -> None:
         device.expect(
             device.value(reply, "triggers", TRIGGERS) == 1,
             "must have one trigger",
-            _found(reply),
+            reply,
         )
     device.accepts("PUMP", kpa=TARGET_KPA)
     device.accepts("STOP")
@@ -624,20 +610,10 @@ def _check_probe(device: _Device, _hello: Message) -> None:
     _rests(device, "0.5 s without a request")
 
 
-def _keep_alive(
-    device: _Device, why: str, verb: str, values: Mapping[str, object]
-) -> None:
-    """A request, refused if there is a reason; any of them resets the watchdog."""
-    if why:
-        device.refuses(why, verb, **values)
-    else:
-        device.accepts(verb, **values)
-
-
 def _exposes(device: _Device, state: str) -> Message:
     """The state of a probe, which must be this one."""
     reply = device.ask("STATUS")
-    device.expect(reply.values.get("state") == state, f"must be {state}", _found(reply))
+    device.expect(reply.values.get("state") == state, f"must be {state}", reply)
     return reply
 
 

@@ -81,6 +81,10 @@ class Message:
     verb: str
     values: Mapping[str, str] = field(default_factory=dict)
 
+    def __str__(self) -> str:
+        """Verb and values, as shown in messages."""
+        return text_of(self.verb, self.values)
+
     def encode(self) -> bytes:
         """The line of this message, with its newline."""
         values = "".join(
@@ -94,6 +98,11 @@ class Message:
         return line
 
 
+def text_of(verb: str, values: Mapping[str, object]) -> str:
+    """A verb and its values, as shown in messages."""
+    return " ".join([verb, *(f"{name}={value}" for name, value in values.items())])
+
+
 def checksum(body: bytes) -> int:
     """CRC-16/CCITT-FALSE: polynomial 0x1021, initial value 0xFFFF, not reflected."""
     return binascii.crc_hqx(body, 0xFFFF)
@@ -104,16 +113,12 @@ def decode(line: bytes) -> Message:
     match = LINE.fullmatch(line)
     if match is None or len(line) >= MAX_LINE_BYTES:
         raise ProtocolError(f"{line[:80]!r} is not a message of the protocol")
-    kind, number, verb, values, crc = match.groups()
+    kind, number, verb, values, crc = (part.decode() for part in match.groups())
     if checksum(line[:-5]) != int(crc, 16):
         raise ProtocolError(f"{line[:80]!r} has a wrong checksum")
-    pairs = [text.partition("=") for text in values.decode("ascii").split()]
-    return Message(
-        kind.decode(),
-        int(number),
-        verb.decode(),
-        {name: unquote(value) for name, _, value in pairs},
-    )
+    pairs = (text.partition("=") for text in values.split())
+    named = {name: unquote(value) for name, _, value in pairs}
+    return Message(kind, int(number), verb, named)
 
 
 class Lines:
@@ -286,7 +291,9 @@ class Link:
         self._start = clock.monotonic()
         self._log: TextIO | None = None
         if log is not None:
-            self._log = _new_file(log).open("x", encoding="ascii")
+            numbered = (log.with_stem(f"{log.stem}-{i}") for i in count(2))
+            path = next(file for file in chain([log], numbered) if not file.exists())
+            self._log = path.open("x", encoding="ascii")
 
     @property
     def damaged(self) -> int:
@@ -309,14 +316,13 @@ class Link:
             self._write(line)
             if (reply := self._wait()) is not None:
                 return self._require_ok(verb, reply)
-        seconds = ATTEMPTS * REPLY_SECONDS
-        noise = ""
+        found = "no reply"
         if self.damaged:
-            noise = (
+            found += (
                 f", and {self.damaged} damaged lines, the last {self._lines.sample!r}"
             )
-        rule = f"must answer {verb} within {seconds:.1f} s"
-        raise NoReplyError(Fault(self.name, rule, f"no reply{noise}", CURE))
+        rule = f"must answer {verb} within {ATTEMPTS * REPLY_SECONDS:.1f} s"
+        raise NoReplyError(Fault(self.name, rule, found, CURE))
 
     def value(self, message: Message, name: str, accepted: Accepted[T]) -> T:
         """A value of a reply or an event.
@@ -351,16 +357,12 @@ class Link:
             except NoReplyError:
                 if self.clock.monotonic() >= deadline:
                     raise
-        greeting = (
-            reply.values.get("kind", "an unknown device"),
-            reply.values.get("protocol", "?"),
-        )
-        if greeting != (kind, str(PROTOCOL)):
-            raise self.error(
-                f"must be a {kind} with protocol {PROTOCOL}",
-                f"{greeting[0]} with protocol {greeting[1]}",
-                "check which device has which address",
-            )
+        found = reply.values.get("kind", "an unknown device")
+        found += f" with protocol {reply.values.get('protocol', '?')}"
+        expected = f"{kind} with protocol {PROTOCOL}"
+        if found != expected:
+            cure = "check which device has which address"
+            raise self.error(f"must be a {expected}", found, cure)
         return reply
 
     def events(self) -> list[Message]:
@@ -389,7 +391,7 @@ class Link:
         """Read the bytes that have arrived, and store their replies and events."""
         try:
             data = self._port.read(4096)
-        except (OSError, serial.SerialException, TypeError) as error:
+        except (OSError, TypeError) as error:
             # TypeError: pyserial with a closed descriptor
             raise self.error("must stay connected", f"{error}") from None
         if not data:
@@ -453,7 +455,7 @@ class Link:
     def _write(self, data: bytes) -> None:
         try:
             self._port.write(data)
-        except (OSError, serial.SerialException) as error:
+        except OSError as error:
             raise self.error("must stay connected", f"{error}") from None
         self._note(">", data)
 
@@ -470,12 +472,6 @@ class Link:
             raise DeviceError(system_fault(error, name)) from None
 
 
-def _new_file(path: Path) -> Path:
-    """The path, with a number added if it exists, so that logs of earlier sessions are kept."""
-    numbered = (path.with_stem(f"{path.stem}-{i}") for i in count(2))
-    return next(file for file in chain([path], numbered) if not file.exists())
-
-
 def open_port(url: str) -> Port:
     """Open a port by its pyserial URL: ``/dev/ttyACM0``, ``socket://host:port``,
     ``loop://``, ``spy://...``.
@@ -489,15 +485,8 @@ def open_port(url: str) -> Port:
         port: Port = serial.serial_for_url(
             url, baudrate=BAUD_RATE, timeout=READ_SECONDS, write_timeout=REPLY_SECONDS
         )
-    except (
-        OSError,
-        ValueError,
-        LookupError,
-        AttributeError,
-        TypeError,
-        serial.SerialException,
-    ) as error:
-        # pyserial parses its URLs without checks and does not catch the errors of parsing
+    except (OSError, ValueError, LookupError, AttributeError, TypeError) as error:
+        # pyserial, whose own error is an OSError, does not catch the errors of parsing
         raise DeviceError(
             Fault(
                 f"address {url}",

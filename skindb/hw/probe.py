@@ -104,13 +104,10 @@ class Gauge:
             t = self._link.value(event, "t", GAUGE_SECONDS)
             kpa = self._link.value(event, "kpa", GAUGE_KPA)
             if not previous < t <= seconds + MAX_AHEAD_SECONDS:
-                received = (
-                    f"{t:.2f} s, {seconds:.2f} s after PUMP and after a reading of "
-                    f"{previous:.2f} s"
-                )
                 raise self._link.error(
                     "must send readings of the gauge in order, with their times since PUMP",
-                    received,
+                    f"{t:.2f} s, {seconds:.2f} s after PUMP and after a reading of "
+                    f"{previous:.2f} s",
                     FIRMWARE_CURE,
                 )
             self._require_recent(t - max(previous, 0.0))
@@ -122,12 +119,9 @@ class Gauge:
     def _require_recent(self, age: float) -> None:
         """Refuse a pressure that was unknown for too long, also if another reading followed."""
         if not age <= MAX_AGE_SECONDS + TIME_PRECISION_SECONDS:
-            finding = (
-                f"none for {age:.2f} s" if self.readings else f"none in {age:.2f} s"
-            )
             raise self._link.error(
                 f"must have a reading of the gauge in the last {MAX_AGE_SECONDS} s",
-                finding,
+                f"none {'for' if self.readings else 'in'} {age:.2f} s",
                 "check the gauge and its cable",
             )
 
@@ -205,8 +199,7 @@ class Probe:
                 triggers[name] = self._expose(name, seconds, gauge)
                 if progress is not None:
                     progress(number + 1, len(exposures))
-        log = np.array(gauge.readings[unused:])
-        return Placement(triggers, log)
+        return Placement(triggers, np.array(gauge.readings[unused:]))
 
     def stop(self) -> None:
         """Switch off light and pump, and open the valve.

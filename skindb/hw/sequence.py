@@ -84,11 +84,9 @@ class Schedule:
             step = self.steps[index]
             length = step.off_us - step.on_us
             chosen.append(replace(step, on_us=start, off_us=start + length))
-            after = (
-                self.steps[index + 1].on_us
-                if index + 1 < len(self.steps)
-                else step.off_us
-            )
+            after = step.off_us
+            if index + 1 < len(self.steps):
+                after = self.steps[index + 1].on_us
             start += max(after - step.on_us, length + round(GAP_SECONDS * 1e6))
         return Schedule(tuple(chosen))
 
@@ -187,11 +185,11 @@ class Assessment:
 
     def __str__(self) -> str:
         """Describe the assessment in words."""
-        rate = (
-            f"at most {self.flashes_per_second} "
-            f"{'flash' if self.flashes_per_second == 1 else 'flashes'} in any second"
+        flashes = "flash" if self.flashes_per_second == 1 else "flashes"
+        return (
+            f"at most {self.flashes_per_second} {flashes} in any second, "
+            f"{self.seconds:.1f} s"
         )
-        return f"{rate}, {self.seconds:.1f} s"
 
 
 @dataclass(frozen=True)
@@ -268,11 +266,9 @@ def partial_schedule(schedule: Schedule, steps: Iterable[int]) -> Schedule:
     """
     part = schedule.subset(steps)
     allowed = assess(schedule).flashes_per_second
-    return (
-        part
-        if assess(part).flashes_per_second <= allowed
-        else slowed_schedule(part, allowed)
-    )
+    if assess(part).flashes_per_second > allowed:
+        return slowed_schedule(part, allowed)
+    return part
 
 
 def slower_alternative(schedule: Schedule) -> str:

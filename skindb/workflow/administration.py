@@ -107,21 +107,13 @@ def backup_states(source: str) -> list[State]:
     return store.backup_states(source)
 
 
-def restore(
-    source: str,
-    url: str,
-    *,
-    number: int | None = None,
-    markers: Path | None = None,
-    without_markers: bool = False,
-) -> Restored:
-    """Restore a database from a backup; see `skindb.store.restore`.
+def restore(source: str, url: str, **options: Any) -> Restored:
+    """Restore a database from a backup; see `skindb.store.restore`, also for the options
+    number, markers and without_markers.
 
     It is logged at its end, because the audit log itself is restored.
     """
-    restored = store.restore(
-        source, url, number=number, markers=markers, without_markers=without_markers
-    )
+    restored = store.restore(source, url, **options)
     db = Database(url)
     with logged_action(db, "restore", db.takes(), counts={"state": restored.number}):
         return restored
@@ -141,8 +133,8 @@ class Refreshed:
     @property
     def name(self) -> str:
         """Kind, generation and take, as shown in messages."""
-        words = [self.kind, *([str(self.generation)] if self.generation else [])]
-        return " ".join([*words, *(["of", self.take] if self.take else [])])
+        generation = f" {self.generation}" if self.generation else ""
+        return f"{self.kind}{generation}" + (f" of {self.take}" if self.take else "")
 
 
 def requested_result(request: Request) -> Refreshed:
@@ -185,11 +177,11 @@ def superseded_calibrations(db: Database) -> dict[str, list[str]]:
     superseded = dict[str, list[str]]()
     for take in db.takes("capture") if max(newest.values(), default=1) > 1 else ():
         record = intact_or_none(partial(db.record, "capture", take))
-        calibration = {} if record is None else record.provenance.get("calibrated_by")
-        if calibration and calibration["generation"] < newest.get(
-            calibration["take"], 0
-        ):
-            superseded.setdefault(calibration["take"], []).append(take)
+        calibration = record and record.provenance.get("calibrated_by")
+        if calibration:
+            name = calibration["take"]
+            if calibration["generation"] < newest.get(name, 0):
+                superseded.setdefault(name, []).append(take)
     return {name: sorted(takes) for name, takes in sorted(superseded.items())}
 
 
@@ -341,11 +333,13 @@ def erasure_report(withdrawal: Withdrawal) -> dict[str, Any]:
     """A report of a withdrawal that can be handed out: it contains no pseudonym,
     attribute, name or path.
     """
-    again = Counter(
-        result.kind for result in withdrawal.repeated if result.record is not None
-    )
-    waiting = Counter(
-        result.kind for result in withdrawal.repeated if result.record is None
+    again, waiting = (
+        Counter(
+            result.kind
+            for result in withdrawal.repeated
+            if (result.record is None) == is_waiting
+        )
+        for is_waiting in (False, True)
     )
     body = {
         "completed": withdrawal.date,

@@ -13,7 +13,7 @@ from xarray import DataTree
 from skindb.analysis.brdf import population_basis
 from skindb.analysis.edit import apply_traits, with_basis
 from skindb.analysis.summary import SAMPLED, common_maps
-from skindb.errors import input_error
+from skindb.errors import require
 from skindb.files import plain
 from skindb.reflectance.dictionary import embedded_dictionary
 from skindb.reflectance.kinds import require_mixture
@@ -46,11 +46,8 @@ class Editable:
 
     def derivation_by(self, amounts: Mapping[str, float]) -> Derivation:
         """What decides an edit by these amounts."""
-        provenance = dict(self.derivation.provenance)
-        provenance["parameters"] = {
-            "study": self.study,
-            "amounts": plain(dict(amounts)),
-        }
+        parameters = {"study": self.study, "amounts": plain(dict(amounts))}
+        provenance = {**self.derivation.provenance, "parameters": parameters}
         return replace(self.derivation, provenance=provenance)
 
 
@@ -311,9 +308,8 @@ def _registered_textures(
     """What moves the texture of a registered take: arguments of `apply_traits`, and the
     record of its registration; nothing for other takes.
     """
-    if "texture" not in vectors.children:
-        return {}, []
-    records = current_registrations(db, [take])
+    is_textured = "texture" in vectors.children
+    records = current_registrations(db, [take]) if is_textured else {}
     if not records:
         return {}, []
     registered = registered_datasets(db, records)[take]
@@ -326,16 +322,12 @@ def _registered_textures(
 def _trait_study(db: Database, name: str | None) -> str:
     """What the study of traits that an edit uses is stored as."""
     stored = [name for name in db.takes(STUDY) if name.partition(".")[0] == "traits"]
-    is_only = len(stored) == 1 and "traits" not in stored
-    study = name or (stored[0] if is_only else "traits")
-    if study not in stored:
-        cure = "run: skindb analyze DB traits"
-        if stored:
-            cure = "name one of them with --study"
-        raise input_error(
-            f"study {study}",
-            "must be a study of traits in the database",
-            f"studies of traits: {', '.join(stored) or 'none'}",
-            cure,
-        )
+    study = name or (stored[0] if len(stored) == 1 else "traits")
+    require(
+        study in stored,
+        f"study {study}",
+        "must be a study of traits in the database",
+        f"studies of traits: {', '.join(stored) or 'none'}",
+        "name one of them with --study" if stored else "run: skindb analyze DB traits",
+    )
     return study

@@ -128,11 +128,8 @@ def show_take(
         for kind in ("model", "capture")
         if take in db.takes(kind)
     }
-    if not trees:
-        takes = ", ".join(db.takes("capture")) or "there is none"
-        raise input_error(
-            "take", "a take of the database is drawn", take, f"choose {takes}"
-        )
+    cure = f"choose {', '.join(db.takes('capture')) or 'there is none'}"
+    require(trees, "take", "a take of the database is drawn", take, cure)
     db.require_consent(take, "export")
     return write_field(trees, variable, out, at=at)
 
@@ -383,20 +380,14 @@ def view_server(
     }
 
     def index() -> bytes:
-        permitted = [_permitted(db, faces, take) for take in takes]
-        return index_text(
-            [face for face in permitted if face is not None], environment=named
-        ).encode()
+        permitted = filter(None, (_permitted(db, faces, take) for take in takes))
+        return index_text(list(permitted), environment=named).encode()
 
     def data(take: str) -> bytes:
         face = _permitted(db, faces, take)
         if face is None:
-            raise input_error(
-                take,
-                "its subject must consent to exports",
-                "no such consent",
-                "show another take",
-            )
+            rule = "its subject must consent to exports"
+            raise input_error(take, rule, "no such consent", "show another take")
         return face.data
 
     contents = {
@@ -441,17 +432,15 @@ def _faces(
         capture = db.read("capture", take) if db.has("capture", take) else None
         if capture is not None:
             attributes |= db.record("capture", take).provenance.get("traits", {})
-        yield (
-            face_record(
-                unedited,
-                take=take,
-                attributes=attributes,
-                traits=moved,
-                environment=around,
-                capture=capture,
-            ),
-            still_picture(model),
+        record = face_record(
+            unedited,
+            take=take,
+            attributes=attributes,
+            traits=moved,
+            environment=around,
+            capture=capture,
         )
+        yield record, still_picture(model)
     progress("view", len(takes), len(takes))
 
 
@@ -525,12 +514,8 @@ def _along_modes(
     records = current_registrations(db, [take])
     require(records, take, "must be registered", "none", "run: skindb register DB")
     registered = registered_datasets(db, records)[take]
-    move = partial(
-        move_along_modes,
-        model,
-        faces=faces,
-        uv=registered[variables.COMMON_UV].values,
-    )
+    uv = registered[variables.COMMON_UV].values
+    move = partial(move_along_modes, model, faces=faces, uv=uv)
     moved = []
     for i in range(min(count, faces.sizes["mode"])):
         full = np.eye(i + 1)[i] * MODE_END

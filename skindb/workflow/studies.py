@@ -30,7 +30,7 @@ from skindb.analysis.subjects import (
     subjects_of,
     subjects_without_normal,
 )
-from skindb.errors import InputError, input_error, require
+from skindb.errors import InputError, require
 from skindb.files import Attributes
 from skindb.format.dome import EXPOSURE_RATIO
 from skindb.parameters import option_of, require_limits
@@ -117,10 +117,11 @@ def open_population(
         _opened, db, release=release, mixed_fits=bool(takes), as_normal=as_normal
     )
     open_models = partial(opened, takes=takes or None)
-    if study.layout != "maps":
-        cohort = open_models(study.layout, **study.cohort_options)
-    else:
-        cohort = open_models("tables")
+    cohort = (
+        open_models("tables")
+        if study.layout == "maps"
+        else open_models(study.layout, **study.cohort_options)
+    )
     registrations: Mapping[str, Record] = {}
     frames = {}
     notes = []
@@ -143,8 +144,17 @@ def open_population(
         return open_registered(layout, **options)
 
     if study.layout == "maps":
-        open_maps = partial(open_cohort, "maps", **study.cohort_options)
-        cohort = _open_maps(db, cohort, registered, open_maps)
+        require(
+            registered,
+            db.url,
+            "maps need registered takes",
+            f"none of {cohort.sizes['take']} takes has landmarks",
+            "add landmarks to the captures, then ingest and fit them",
+        )
+        # without a probe there is no map of sigma_tr
+        maps = open_cohort("maps", **study.cohort_options)
+        skipped = [*cohort.attrs["skipped"], *maps.attrs["skipped"]]
+        cohort = maps.assign_attrs(skipped=unique_notes(skipped))
     population = Population(
         cohort,
         open_cohort,
@@ -153,7 +163,14 @@ def open_population(
         registered=registered,
         notes=notes,
     )
-    return population, [*_models(db, cohort), *registrations.values()]
+    generations = zip(
+        cohort["take"].values.tolist(),
+        cohort["model_generation"].values.astype(int).tolist(),
+        strict=True,
+    )
+    lookup = Lookup(db)
+    models = [lookup.generation("model", *key) for key in generations]
+    return population, [*models, *registrations.values()]
 
 
 def _opened(
@@ -212,7 +229,8 @@ def _require_one_scale(db: Database, study: Study, inputs: Sequence[Record]) -> 
                 about = db.record(*key).provenance
                 exposures[about.get("relative_exposure", 0.0)] = record.take
     exposures.pop(0.0, None)  # unknown
-    low, high = (f(exposures, default=0.0) for f in (min, max))
+    low = min(exposures, default=0.0)
+    high = max(exposures, default=0.0)
     require(
         high <= EXPOSURE_RATIO * low,
         ", ".join(exposures[x] for x in (low, high) if x in exposures),
@@ -220,36 +238,6 @@ def _require_one_scale(db: Database, study: Study, inputs: Sequence[Record]) -> 
         f"{low:.3g} and {high:.3g}, which the imports recorded",
         "name takes of one exposure with --take",
     )
-
-
-def _open_maps(
-    db: Database,
-    models: Dataset,
-    registered: Sequence[str],
-    open_maps: Callable[[], Dataset],
-) -> Dataset:
-    """Maps of the registered takes; without a probe there is no map of sigma_tr."""
-    require(
-        registered,
-        db.url,
-        "maps need registered takes",
-        f"none of {models.sizes['take']} takes has landmarks",
-        "add landmarks to the captures, then ingest and fit them",
-    )
-    maps = open_maps()
-    skipped = [*models.attrs["skipped"], *maps.attrs["skipped"]]
-    return maps.assign_attrs(skipped=unique_notes(skipped))
-
-
-def _models(db: Database, cohort: Dataset) -> list[Record]:
-    """Records of the models of a cohort."""
-    takes = cohort["take"].values
-    generations = cohort["model_generation"].values
-    lookup = Lookup(db)
-    return [
-        lookup.generation("model", str(take), int(generation))
-        for take, generation in zip(takes, generations, strict=True)
-    ]
 
 
 def _brdf_tables(
@@ -279,22 +267,19 @@ def require_covered(db: Database, release: str | None) -> None:
         return
     lookup = Lookup(db, release)
     staleness = Staleness(db)
-    records = [
-        lookup.record("registration", take) for take in lookup.takes("registration")
-    ]
-    reasons = [
-        reason
-        for record in records
-        for reason in staleness.reasons(record)
+    causes = dict.fromkeys(
+        str(reason)
+        for take in lookup.takes("registration")
+        for reason in staleness.reasons(lookup.record("registration", take))
         if reason.why != "superseded"
-    ]
-    if causes := list(dict.fromkeys(map(str, reasons))):
-        raise input_error(
-            f"release {release}",
-            "the registrations of a release must be covered by consent",
-            "; ".join(causes),
-            "run skindb refresh, and make another release",
-        )
+    )
+    require(
+        not causes,
+        f"release {release}",
+        "the registrations of a release must be covered by consent",
+        "; ".join(causes),
+        "run skindb refresh, and make another release",
+    )
 
 
 def _registrations(
@@ -364,11 +349,9 @@ def study(
         For another study or other parameters, without takes that consent to statistics,
         or if they were fitted with different parameters and none is named.
     """
-    if what not in STUDIES:
-        cure = f"choose from {', '.join(STUDIES)}"
-        raise input_error(
-            f"study {what}", "must be a known study", "another name", cure
-        )
+    cure = f"choose from {', '.join(STUDIES)}"
+    known = "must be a known study"
+    require(what in STUDIES, f"study {what}", known, "another name", cure)
     record = STUDIES[what]
     chosen = _parameters(record, parameters)
     # what another run needs to repeat the study
@@ -447,9 +430,8 @@ def study_key(record: Study, requested: Attributes, name: str | None) -> str:
     """
     if name is not None:
         return f"{record.name}.{require_text(name, STUDY_NAME, 'name of a study')}"
-    defaults = {"takes": [], "as_normal": [], "release": ""} | {
-        spec.name: _plain(spec.default) for spec in fields(record.parameters)
-    }
+    defaults = {spec.name: _plain(spec.default) for spec in fields(record.parameters)}
+    defaults |= {"takes": [], "as_normal": [], "release": ""}
     chosen = {
         key: value
         for key, value in requested.items()
@@ -504,19 +486,16 @@ def _parameters(record: Study, options: Attributes) -> Any:
     """The parameters of a study as its record, checked."""
     specs = {spec.name: spec for spec in fields(record.parameters)}
     place = f"study {record.name}"
-    if unknown := sorted(options.keys() - specs.keys()):
-        raise input_error(
-            place,
-            f"its parameters are {', '.join(specs) or 'none'}",
-            ", ".join(unknown),
-            "omit the others",
-        )
-    required = [name for name, spec in specs.items() if spec.default is MISSING]
-    if missing := [name for name in required if options.get(name) is None]:
-        names = " and ".join(missing)
-        raise input_error(
-            place, f"needs {names}", "none", f"give {names}, such as 'gender'"
-        )
+    unknown = ", ".join(sorted(options.keys() - specs.keys()))
+    rule = f"its parameters are {', '.join(specs) or 'none'}"
+    require(not unknown, place, rule, unknown, "omit the others")
+    names = " and ".join(
+        name
+        for name, spec in specs.items()
+        if spec.default is MISSING and options.get(name) is None
+    )
+    cure = f"give {names}, such as 'gender'"
+    require(not names, place, f"needs {names}", "none", cure)
     chosen = dict(options)
     if isinstance(chosen.get("adjust"), str):
         chosen["adjust"] = (chosen["adjust"],)

@@ -161,9 +161,12 @@ class LocalProcesses:
             raise
 
     def _pool(self) -> Pool:
-        start = {"initializer": _start_worker, "initargs": (os.getpid(),)}
         pool: Pool = get_reusable_executor(
-            self.workers, timeout=IDLE_SECONDS, env=LOKY, **start
+            self.workers,
+            timeout=IDLE_SECONDS,
+            env=LOKY,
+            initializer=_start_worker,
+            initargs=(os.getpid(),),
         )
         return pool
 
@@ -261,23 +264,22 @@ class Expected:
 
     def require(self, worker: str) -> None:
         """Raise an `InputError` if this process, which is the named worker, has something else."""
-        if (self.version, self.code) != (__version__, package_digest()):
-            finding = f"version {__version__}"
-            finding += "" if __version__ != self.version else " with other source code"
-            raise input_error(
-                f"worker {worker}",
-                f"must run the same skindb as this process ({self.version})",
-                finding,
-                "install the same version, restart the worker",
-            )
-        if self.token and not Path(self.token).is_file():
-            folder = str(Path(self.token).parent.parent)
-            raise input_error(
-                f"worker {worker}",
-                f"must see the database {folder}",
-                "no such folder, or another one",
-                "use a folder that all machines share",
-            )
+        other_code = " with other source code" if __version__ == self.version else ""
+        require(
+            (self.version, self.code) == (__version__, package_digest()),
+            f"worker {worker}",
+            f"must run the same skindb as this process ({self.version})",
+            f"version {__version__}{other_code}",
+            "install the same version, restart the worker",
+        )
+        token = Path(self.token)
+        require(
+            not self.token or token.is_file(),
+            f"worker {worker}",
+            f"must see the database {token.parent.parent}",
+            "no such folder, or another one",
+            "use a folder that all machines share",
+        )
 
 
 @contextmanager
@@ -610,17 +612,14 @@ def results_of(outcomes: Iterable[Outcome[Take, Result]]) -> Iterator[Result]:
     """The results; at the end one `InputError` with the faults of every take that failed."""
     faults = []
     for outcome in outcomes:
+        faults += faults_of(outcome)
         if outcome.error is None:
             yield outcome.result()
-        else:
-            faults += faults_of(outcome)
     require_none(faults)
 
 
 def faults_of(outcome: Outcome[Take, Result]) -> list[Fault]:
     """Faults of a take that failed."""
-    if isinstance(outcome.error, InputError):
-        return list(outcome.error.faults)
-    if outcome.error is None:
-        return []
-    return [system_fault(outcome.error, str(outcome.take))]
+    if isinstance(outcome.error, OSError):
+        return [system_fault(outcome.error, str(outcome.take))]
+    return list(outcome.error.faults) if outcome.error else []

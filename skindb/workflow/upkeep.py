@@ -87,12 +87,8 @@ def refresh(
         with computing_on(client if kind == STUDY else None, db.folder):
             results += repeat_requests(db, dictionary=dictionary, kinds=(kind,))
             # what was made before made others stale
-            stale = [
-                result
-                for result in stale_results(db)
-                if result.kind == kind and result.generation
-            ]
-            if stale:
+            made = [one for one in stale_results(db) if one.generation]
+            if stale := [result for result in made if result.kind == kind]:
                 results += makers[kind](stale)
     progress("refresh", len(KINDS), len(KINDS))
     return results
@@ -117,17 +113,14 @@ def repeat_requests(
         One for each request, in order of dependence. What fails for any reason is named
         there, and stays requested.
     """
-    requests = sorted(
-        db.requests(), key=lambda request: (KINDS.index(request.kind), request.take)
-    )
+    requests = [request for request in db.requests() if request.kind in kinds]
     results = []
-    for request in requests:
-        if request.kind in kinds:
-            make = partial(_repeat, db, dictionary, request)
-            outcome = _again(requested_result(request), make)
-            if outcome.record is not None:
-                db.fulfil(request)
-            results.append(outcome)
+    for request in sorted(requests, key=lambda one: (KINDS.index(one.kind), one.take)):
+        make = partial(_repeat, db, dictionary, request)
+        outcome = _again(requested_result(request), make)
+        if outcome.record is not None:
+            db.fulfil(request)
+        results.append(outcome)
     return results
 
 
@@ -135,12 +128,12 @@ def _repeat(db: Database, dictionary: Path | None, request: Request) -> Record:
     """Compute a result again."""
     if request.kind == "registration":
         # all takes together: the common (u, v) depends on each of them
-        reference = request.parameters.get("reference") or None
-        if reference not in db.takes("model") or "statistics" not in db.consent(
-            reference
-        ):
-            reference = None
-        return next(iter(register_takes(db, reference=reference).values()))
+        reference = request.parameters.get("reference", "")
+        is_fitted = reference in db.takes("model")
+        usable = is_fitted and "statistics" in db.consent(reference)
+        return next(
+            iter(register_takes(db, reference=reference if usable else None).values())
+        )
     if request.kind == RELEASE:
         return _repeat_release(db, request)
     if request.kind == STUDY:
@@ -169,7 +162,6 @@ def repeat_study(
     """
     options = dict(parameters)
     study_name = str(options.pop("what", ""))
-    name = key.partition(".")[2]
     rule = "a study must be one that this version of skindb can compute"
     cure = "run skindb analyze"
     require(study_name in STUDIES, key, rule, f"the study {study_name!r}", cure)
@@ -183,16 +175,18 @@ def repeat_study(
         raise input_error(
             key, "a study needs fitted takes", "no version of it is left", cure
         )
-    options |= {
-        "takes": [take for take in takes if take in stored],
-        "release": release,
-        "name": name or None,
-    }
     if "group_by" in options:
         options["group_by"] = options["group_by"] or None
     if "dictionary" in accepted:
         options["dictionary"] = dictionary
-    results = study(db, study_name, **options)
+    results = study(
+        db,
+        study_name,
+        takes=[take for take in takes if take in stored],
+        release=release,
+        name=key.partition(".")[2] or None,
+        **options,
+    )
     return db.record(STUDY, key, results.attrs["generation"])
 
 
@@ -209,12 +203,17 @@ def _repeat_release(db: Database, request: Request) -> Record:
         "that they could not be computed yet",
         "run skindb refresh",
     )
-    registrations = []
-    for take in request.parameters.get("takes", []):
-        if db.has("registration", take):
-            record = db.record("registration", take)
-            if models.get(take) in {pin["seal"] for pin in record.made_from}:
-                registrations.append(record.as_input())
+    takes = request.parameters.get("takes", [])
+    records = [
+        db.record("registration", take)
+        for take in takes
+        if db.has("registration", take)
+    ]
+    registrations = [
+        record.as_input()
+        for record in records
+        if models.get(record.take) in {pin["seal"] for pin in record.made_from}
+    ]
     if not registrations and "pins" not in request.parameters:
         return db.record(RELEASE, request.take)
     return db.commit_release(request.take, [*pins, *registrations])
@@ -227,14 +226,16 @@ def _fit_again(
     resources: Attributes,
     stale: Sequence[Refreshed],
 ) -> list[Refreshed]:
-    stale_models = {result.take: result for result in stale}
+    models = {result.take: result for result in stale}
     call = partial(fit_with, db, changes={}, dictionary=dictionary, wait=wait)
-    results = []
-    for outcome in map_takes(call, list(stale_models), **resources, shared=db.folder):
-        record = outcome.value if isinstance(outcome.value, Record) else None
-        fault = str(outcome.error or "")
-        results.append(replace(stale_models[outcome.take], record=record, fault=fault))
-    return results
+    return [
+        replace(
+            models[outcome.take],
+            record=outcome.value if isinstance(outcome.value, Record) else None,
+            fault=str(outcome.error or ""),
+        )
+        for outcome in map_takes(call, list(models), **resources, shared=db.folder)
+    ]
 
 
 def _register_again(
@@ -273,7 +274,5 @@ def _again(result: Refreshed, make: Callable[[], Record]) -> Refreshed:
         return replace(result, fault=str(error))
     # for example parameters of another version of skindb, or too little memory
     except Exception as error:  # noqa: BLE001
-        return replace(
-            result,
-            fault=f"cannot be computed by this version: {type(error).__name__}: {error}",
-        )
+        text = f"{type(error).__name__}: {error}"
+        return replace(result, fault=f"cannot be computed by this version: {text}")
