@@ -269,13 +269,11 @@ class Database:
         """Consent attributes of a version that is read; the scope is empty if the
         newest record was lost.
         """
+        versions = ((CONSENT, subject_of(take)), ("capture", take), ("model", take))
         try:
-            says = (
-                self.has(CONSENT, subject_of(take))
-                or self.has("capture", take)
-                or self.has("model", take)
-            )
-            return {"consent_scope": self.consent(take)} if says else {}
+            snapshot = Snapshot(self.place)
+            is_known = any(snapshot.has(*version) for version in versions)
+            return {"consent_scope": self.consent(take)} if is_known else {}
         except InputError:
             return {"consent_scope": []}
 

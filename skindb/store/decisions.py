@@ -17,14 +17,9 @@ MAX_NAMED = 8  # subjects in a message
 def record_consent(place: Place, subject: str, scope: Iterable[str]) -> Record:
     """See `Database.record_consent`."""
     scopes = list(dict.fromkeys(scope))
-    if unknown := [name for name in scopes if name not in SCOPES]:
-        finding = ", ".join(map(repr, unknown))
-        raise input_error(
-            "scope",
-            f"a scope must be one of {', '.join(SCOPES)}",
-            finding,
-            "choose from these",
-        )
+    unknown = ", ".join(repr(name) for name in scopes if name not in SCOPES)
+    rule = f"a scope must be one of {', '.join(SCOPES)}"
+    require(not unknown, "scope", rule, unknown, "choose from these")
     require_subject(place, subject)
     with Stage(place, CONSENT, subject) as stage:
         record = stage.commit({"subject": subject, "consent_scope": scopes})
@@ -36,12 +31,9 @@ def consent_history(place: Place, subject: str) -> list[dict[str, Any]]:
     """See `Database.consent_history`."""
     snapshot = Snapshot(place)
     takes = [take for take in snapshot.takes("capture") if subject_of(take) == subject]
-    sources = [
-        (snapshot.record("capture", take), f"capture of {take}") for take in takes
-    ]
+    sources = [(snapshot.record("capture", t), f"capture of {t}") for t in takes]
     if snapshot.has(CONSENT, subject):
-        records = snapshot.history(CONSENT, subject)
-        sources += [(record, "record") for record in records]
+        sources += [(one, "record") for one in snapshot.history(CONSENT, subject)]
     if not sources:
         require_subject(place, subject)
     return [

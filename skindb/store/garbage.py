@@ -219,11 +219,7 @@ def _old_blocks(place: Place, now: Clock) -> list[Garbage]:
     """
     what = "tables that studies gathered a month ago"
     blocks = _loose_files(place, GATHERED, what, now, KEPT_BLOCK_SECONDS)
-    return [
-        block
-        for block in blocks
-        if not block.kept and re.fullmatch(BLOCK_KEY, block.key)
-    ]
+    return [one for one in blocks if not one.kept and re.fullmatch(BLOCK_KEY, one.key)]
 
 
 def _scratch_folders(place: Place, now: Clock) -> Iterator[Garbage]:

@@ -20,7 +20,13 @@ from skindb.store.place import (
     Place,
     subject_of,
 )
-from skindb.store.record import Record, inputs_in, intact_or_none, own_takes
+from skindb.store.record import (
+    Record,
+    inputs_in,
+    intact_or_none,
+    own_takes,
+    subjects_of,
+)
 
 # kind -> scope that its subjects must consent to when it is committed; a record of
 # consent needs none
@@ -72,11 +78,7 @@ def names_of(
     A capture or a model may be made from a product of many subjects, such as a
     calibration, and outlives it; it does not refer to these subjects.
     """
-    names = {
-        str(reference["take"])
-        for reference in inputs_in(provenance)
-        if reference["kind"] not in KINDS_WITHOUT_SUBJECT
-    }
+    names = _takes_in(provenance)
     # a release names versions, but has none of their data
     if kind not in (*KINDS_OF_ONE_SUBJECT, RELEASE):
         names = names.union(*(record.names for record in inputs))
@@ -106,13 +108,7 @@ def require_consents(
     scope = REQUIRED_SCOPES.get(kind)
     if scope is None:
         return
-    of_takes = [
-        reference
-        for reference in inputs_in(provenance)
-        if reference["kind"] not in KINDS_WITHOUT_SUBJECT
-    ]
-    subjects = {subject_of(reference["take"]) for reference in of_takes}
-    subjects |= set() if kind in KINDS_WITHOUT_SUBJECT else {subject_of(take)}
+    subjects = subjects_of(kind, take, _takes_in(provenance))
     faults = []
     for subject in sorted(subjects):
         log = Log(place, CONSENT, subject)
@@ -137,6 +133,15 @@ def _record_of(place: Place, reference: Attributes) -> Record | None:
     record = intact_or_none(partial(log.read, reference["generation"]))
     is_same = record is not None and record.seal == reference["seal"]
     return record if is_same else None
+
+
+def _takes_in(provenance: Attributes) -> set[str]:
+    """Takes of the inputs of a version."""
+    return {
+        str(reference["take"])
+        for reference in inputs_in(provenance)
+        if reference["kind"] not in KINDS_WITHOUT_SUBJECT
+    }
 
 
 def _name(reference: Attributes) -> str:

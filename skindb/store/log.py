@@ -110,30 +110,21 @@ class Log:
             If its generation exists already.
         """
         content, seal = record_to_json(record)
+        number = record.generation
         try:
-            created = self.place.create(
-                self.record_key(record.generation), content, guard=guard
-            )
+            created = self.place.create(self.record_key(number), content, guard=guard)
         except WithdrawnError:
-            if (
-                record.generation in self.generations()
-                and self._read(record.generation).seal == seal
-            ):
+            if number in self.generations() and self._read(number).seal == seal:
                 # in a bucket, where another writer may have seen it
-                self.remove(record.generation)
+                self.remove(number)
             raise
         if not created:
-            raise Conflict(
-                Fault(
-                    self.what,
-                    "a generation must be committed only once",
-                    f"generation {record.generation} was committed by another writer",
-                    "run the command again",
-                )
-            )
+            rule = "a generation must be committed only once"
+            finding = f"generation {number} was committed by another writer"
+            raise Conflict(Fault(self.what, rule, finding, "run the command again"))
         # the record is committed, even if the cache cannot be written
         with suppress(OSError, InputError):
-            head = self.head_content(record.generation, seal)
+            head = self.head_content(number, seal)
             self.place.replace(self.head_key, head, guard=guard)
         return replace(record, seal=seal)
 
@@ -171,19 +162,15 @@ class Log:
 
     def readable(self) -> list[Record]:
         """All readable records, oldest first; damaged ones are skipped."""
-        read = [
-            intact_or_none(partial(self._read, generation))
-            for generation in self.generations()
-        ]
+        read = (intact_or_none(partial(self._read, n)) for n in self.generations())
         return [record for record in read if record is not None]
 
     def head(self) -> Json:
         """Generation and seal of the newest record from the cache; empty if the cache
         is missing or damaged.
         """
-        head = intact_or_none(lambda: json_object(self.place.read_small(self.head_key)))
-        if head is None:
-            return {}
+        read = partial(self.place.read_small, self.head_key)
+        head = intact_or_none(lambda: json_object(read())) or {}
         digest = head.pop("digest", None)
         is_whole = (
             isinstance(head.get("generation"), int)
@@ -210,14 +197,13 @@ class Log:
             return []
         while missing and tombstone is not None:
             before = tombstone["previous"]
-            missing = missing - 1
+            missing -= 1
             tombstone = self._tombstone(before)
         if missing:
-            rule = f"generation {preceding + 1} must exist"
+            last = preceding + missing
+            rule = f"generation {last} must exist"
             if missing > 1:
-                rule = (
-                    f"generations {preceding + 1} to {preceding + missing} must exist"
-                )
+                rule = f"generations {preceding + 1} to {last} must exist"
             finding = "no record and no tombstone"
         elif seal not in ("?", before):
             rule = f"generation {record.generation} must follow the record before it"
@@ -267,14 +253,10 @@ class Log:
         """The tombstone of the record with this seal; None if there is none."""
         if not seal:
             return None
-        tombstone = intact_or_none(
-            lambda: json_object(self.place.read_small(tombstone_of(seal)))
-        )
-        is_whole = (
-            tombstone is not None
-            and tombstone.get("seal") == seal
-            and isinstance(tombstone.get("previous"), str)
-        )
+        read = partial(self.place.read_small, tombstone_of(seal))
+        tombstone = intact_or_none(lambda: json_object(read())) or {}
+        previous = tombstone.get("previous")
+        is_whole = tombstone.get("seal") == seal and isinstance(previous, str)
         return tombstone if is_whole else None
 
     def record_key(self, generation: int) -> str:

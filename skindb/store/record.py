@@ -139,10 +139,8 @@ class Record:
 
     def is_outdated(self, capture: Record) -> bool:
         """Whether a model was made from earlier captures only than this one."""
-        generations = [
-            number for kind, _, number in self.input_keys if kind == "capture"
-        ]
-        return bool(generations) and capture.generation not in generations
+        used = [number for kind, _, number in self.input_keys if kind == "capture"]
+        return bool(used) and capture.generation not in used
 
     @property
     def title(self) -> str:
@@ -194,14 +192,13 @@ def record_from_json(content: bytes, key: str) -> Record:
         written by another release of skindb.
     """
     body = json_object(content)
-    require_format("record", body.get("format"), FORMAT)
+    require_format("record", body.pop("format", None), FORMAT)
     seal = body.pop("seal", None)
-    if seal != seal_of(body):
+    if seal != seal_of(body | {"format": FORMAT}):
         raise ValueError("content that does not match its seal")
-    if body.keys() != {*FIELDS, "format"}:
-        raise ValueError(
-            f"fields that do not match its format: {', '.join(sorted(body))[:200]}"
-        )
+    if body.keys() != FIELDS.keys():
+        names = ", ".join(sorted(body))[:200]
+        raise ValueError(f"fields that do not match its format: {names}")
     provenance = body["provenance"]
     # before the variables, which another schema may not have
     if isinstance(provenance, dict) and "schema_version" in provenance:
@@ -210,15 +207,13 @@ def record_from_json(content: bytes, key: str) -> Record:
         raise ValueError(f"invalid values of {', '.join(wrong)}")
     if not {"schema_version", "software_version"} <= provenance.keys():
         raise ValueError("a record without provenance")
-    if f"log/{body['kind']}/{body['take']}/{body['generation']:08d}.json" != key:
-        raise ValueError(
-            f"the record of {body['kind']} {body['generation']} of {body['take']}"
-        )
-    if not body["path"].startswith(f"data/{body['kind']}/{body['take']}/"):
-        raise ValueError(f"the path of another take, {body['path']}")
-    body.pop("format")
-    body["names"] = tuple(body["names"])
-    return Record(**body, seal=seal)
+    record = Record(**body | {"names": tuple(body["names"])}, seal=seal)
+    folder = f"{record.kind}/{record.take}/"
+    if f"log/{folder}{record.generation:08d}.json" != key:
+        raise ValueError(f"the record of {record.title}")
+    if not record.path.startswith(f"data/{folder}"):
+        raise ValueError(f"the path of another take, {record.path}")
+    return record
 
 
 def require_format(what: str, found: object, expected: int) -> None:
@@ -230,11 +225,7 @@ def require_format(what: str, found: object, expected: int) -> None:
 
 
 def _is_count(value: object) -> bool:
-    return (
-        isinstance(value, int)
-        and not isinstance(value, bool)
-        and 0 <= value <= MAX_COUNT
-    )
+    return type(value) is int and 0 <= value <= MAX_COUNT
 
 
 def _fits(value: object, shape: Shape) -> bool:

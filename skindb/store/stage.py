@@ -103,11 +103,9 @@ class Stage:
         self.place = place
         self.log = Log(place, kind, take)
         self.lease = lease
-        names = list(names)
-        require_own_subject(kind, take, names)
-        self.names = sorted(
-            {require_text(name, TAKE, "take") for name in names} - own_takes(kind, take)
-        )
+        named = {require_text(name, TAKE, "take") for name in names}
+        require_own_subject(kind, take, named)
+        self.names = sorted(named - own_takes(kind, take))
         subjects = frozenset(subjects_of(kind, take, self.names))
         self._guard = WithdrawalGuard(place, subjects)
         self._guard()
@@ -117,12 +115,14 @@ class Stage:
             f"data/{kind}/{take}/{now:%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:8]}.zarr"
         )
         # finds a damaged record before the work
-        current = None if self.log.is_empty() else self.log.read()
-        self.base, self.previous = (
-            (current.generation, current.seal) if current else (0, "")
-        )
-        if current is None:
+        self.base = 0
+        self.previous = ""
+        if self.log.is_empty():
             require_secret(place)
+        else:
+            current = self.log.read()
+            self.base = current.generation
+            self.previous = current.seal
         self.committed = False
         self._is_declared = kind in KINDS_OF_ONE_SUBJECT
         self.contents: Json = {}
@@ -264,9 +264,8 @@ class Stage:
     def _written_files(self) -> Manifest:
         """Size and digests of every file, with those of all groups that were written."""
         sizes = self.place.sizes(self.path)
-        gone = [
-            name for name in sorted(self.groups) if f"{name}/zarr.json" not in sizes
-        ]
+        groups = sorted(self.groups)
+        gone = [name for name in groups if f"{name}/zarr.json" not in sizes]
         require(
             not gone,
             self.log.what,
@@ -364,9 +363,8 @@ def describe(ds: Dataset) -> Json:
         for dim in ds.dims
         if dim in ds.coords and ds.sizes[dim] <= MAX_LABELS
     }
-    sizes = {str(dim): size for dim, size in ds.sizes.items()}
     return {
-        "sizes": sizes,
+        "sizes": {str(dim): size for dim, size in ds.sizes.items()},
         "variables": sorted(map(str, ds.data_vars)),
         "labels": labels,
     }
@@ -374,13 +372,11 @@ def describe(ds: Dataset) -> Json:
 
 def tables_to_json(tables: Dataset) -> Json:
     """Values and labels of a small Dataset of schema variables."""
-    labels = {str(name): plain(coord.values) for name, coord in tables.coords.items()}
-    return {
-        "labels": labels,
-        "values": {
-            str(name): plain(array.values) for name, array in tables.data_vars.items()
-        },
-    }
+    labels, values = (
+        {str(name): plain(array.values) for name, array in arrays.items()}
+        for arrays in (tables.coords, tables.data_vars)
+    )
+    return {"labels": labels, "values": values}
 
 
 def tables_from_json(content: Attributes) -> Dataset:
@@ -396,9 +392,8 @@ def read_tables(place: Place, record: Record) -> Dataset:
     """The tables beside a version; empty if it has none."""
     if not record.tables:
         return Dataset()
-    return tables_from_json(
-        json_object(read_beside(place, record, TABLES, record.tables))
-    )
+    content = read_beside(place, record, TABLES, record.tables)
+    return tables_from_json(json_object(content))
 
 
 def _faults(name: str, ds: Dataset) -> list[Fault]:
