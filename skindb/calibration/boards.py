@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from skindb.errors import Fault, few_names, require, require_none
+from skindb.files import Attributes, Json
 from skindb.format.fields import Fields, read_json
 from skindb.format.frames import CAMERA, Frame, filled, opencv, read_frame
 from skindb.geometry.camera import Pinhole
@@ -109,7 +110,7 @@ def read_boards(folder: Path) -> Boards:
     return Boards(corners, views, sizes)
 
 
-def board_corners(board: Mapping[str, Any], frame: Frame) -> tuple[Index, Float64]:
+def board_corners(board: Attributes, frame: Frame) -> tuple[Index, Float64]:
     """Corners, and their pixels (n, 2), of the board of a boards.json in a picture."""
     names = ("squares", "square", "marker")
     described = {name: board[name] for name in names}
@@ -340,8 +341,8 @@ def _pinhole(numbers: Array) -> Pinhole:
 
 
 def with_cameras(
-    record: Mapping[str, Any], boards: Boards, cameras: Mapping[str, CalibratedCamera]
-) -> dict[str, Any]:
+    record: Attributes, boards: Boards, cameras: Mapping[str, CalibratedCamera]
+) -> Json:
     """The content of a dome.json with these cameras: those of the same id keep their other keys."""
     before = {item.get("id"): item for item in record.get("cameras", [])}
     require(

@@ -7,12 +7,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from skindb.errors import Fault, InputError, attempt, require, require_none
+from skindb.files import Attributes, Json
 from skindb.format.contact_probe import ProbeRecord, read_probe
 from skindb.format.dome import CameraRecord, DomeRecord, read_dome
 from skindb.format.fields import Fields, read_json, shown
@@ -60,7 +60,7 @@ def read_setup_dome(
     *,
     white: bool = True,
     dark: bool = True,
-    record: Mapping[str, Any] | None = None,
+    record: Attributes | None = None,
 ) -> DomeRecord:
     """The dome of a set-up folder, which has no frames of a face; frames of a `white`
     target are required by default.
@@ -95,7 +95,7 @@ def read_setup_dome(
     return dome
 
 
-def with_placeholders(record: Mapping[str, Any]) -> dict[str, Any]:
+def with_placeholders(record: Attributes) -> Json:
     """The content of a dome.json whose geometry is not measured, with any geometry: cameras
     at one place, all lights at another, and the white target in the holder of the board.
 
@@ -114,7 +114,7 @@ def with_placeholders(record: Mapping[str, Any]) -> dict[str, Any]:
     return filled_in
 
 
-_PLACEHOLDERS: dict[str, dict[str, Any]] = {
+_PLACEHOLDERS: dict[str, Json] = {
     "cameras": {
         "K": [[1000, 0, 0], [0, 1000, 0], [0, 0, 1]],
         "R": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],

@@ -30,7 +30,7 @@ from skindb.errors import (
     require,
     require_none,
 )
-from skindb.files import Json, plain
+from skindb.files import Attributes, Json, plain
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -309,7 +309,7 @@ def summary_of(record: Record) -> Json:
     return {"generation": record.generation, "path": record.path, **parts}
 
 
-def calibrated_by_lines(provenance: Mapping[str, Any]) -> list[str]:
+def calibrated_by_lines(provenance: Attributes) -> list[str]:
     """The calibration that a capture used, and why if the capture does not name it."""
     if not (used := provenance.get("calibrated_by")):
         return []

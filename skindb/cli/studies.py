@@ -25,7 +25,7 @@ from skindb.cli.options import (
 from skindb.cli.shared import aligned, cluster, emit, existing, shared_path, writable
 from skindb.cli.terminal import HelpContext, bar
 from skindb.errors import input_error
-from skindb.files import csv_text, private_file
+from skindb.files import Json, csv_text, private_file
 from skindb.study_parameters import DECLARED, Declaration
 
 if TYPE_CHECKING:
@@ -226,7 +226,7 @@ def _report(
     emit(report, [*visits, *table, *notes, *_note_lines(report)])
 
 
-def _note_lines(notes: dict[str, Any]) -> list[str]:
+def _note_lines(notes: Json) -> list[str]:
     """The notes of `NOTES` with their labels, one line each."""
     return [
         f"{label}: {line}"

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -24,7 +24,7 @@ from skindb.cli.shared import (
     indented,
 )
 from skindb.errors import InputError, input_error
-from skindb.files import Json
+from skindb.files import Attributes, Json
 
 if TYPE_CHECKING:
     from skindb.store import BackupReport, Database, Restored
@@ -247,7 +247,7 @@ def audit(db: str, subject: str | None) -> None:
     emit([asdict(entry) for entry in entries], lines, faults)
 
 
-def _pairs(values: Mapping[str, Any]) -> str:
+def _pairs(values: Attributes) -> str:
     """Names and values on one line; the name alone of a flag that is set."""
     return ", ".join(
         name if value is True else f"{name} {value}" for name, value in values.items()

@@ -22,7 +22,7 @@ from skindb.demo.page import (
     portrait,
     predictions,
 )
-from skindb.files import filled_template, make_private, private_file
+from skindb.files import Json, filled_template, make_private, private_file
 from skindb.render.image import image_url
 from skindb.render.photographs import Comparison, compare_images
 from skindb.schema import FitStatus, variables
@@ -41,7 +41,7 @@ class Results:
     """Models, errors, studies and edits of a demo."""
 
     models: dict[str, xr.DataTree] = field(default_factory=dict)
-    fits: dict[str, dict[str, Any]] = field(default_factory=dict)
+    fits: dict[str, Json] = field(default_factory=dict)
     recovered: dict[str, Recovery] = field(default_factory=dict)
     compared: dict[str, list[Comparison]] = field(default_factory=dict)
     studies: dict[str, xr.DataTree] = field(default_factory=dict)
@@ -81,7 +81,7 @@ def write_report(path: Path, results: Results, *, progress: Progress) -> Path:
         for comparison in compared
         if comparison.held_out
     ]
-    content: dict[str, Any] = {
+    content: Json = {
         "version": __version__,
         "viewer": VIEWER,
         "minutes": (time.monotonic() - results.began) / 60,
@@ -116,9 +116,7 @@ def write_report(path: Path, results: Results, *, progress: Progress) -> Path:
     return path
 
 
-def _takes(
-    results: Results, portraits: Portraits, counts: dict[str, Any]
-) -> list[dict[str, Any]]:
+def _takes(results: Results, portraits: Portraits, counts: Json) -> list[Json]:
     """Attributes, errors and pictures of each take."""
     drawn = portraits.cut(portraits.images)
     maps = map_pictures(results.models)
@@ -164,7 +162,7 @@ def _takes(
     return takes
 
 
-def _study(name: str, study: xr.DataTree, folder: Path) -> dict[str, Any]:
+def _study(name: str, study: xr.DataTree, folder: Path) -> Json:
     """Plot, notes and table of a study."""
     plot = f"{PLOTS}/{name}.png"
     make_private(folder / PLOTS)
@@ -174,7 +172,7 @@ def _study(name: str, study: xr.DataTree, folder: Path) -> dict[str, Any]:
     return {"name": name, "plot": plot, "notes": notes, "header": header, "rows": rows}
 
 
-def _edit(results: Results, portraits: Portraits) -> dict[str, Any] | None:
+def _edit(results: Results, portraits: Portraits) -> Json | None:
     """Pictures of the edited models, their distance from the data, and their colour difference
     from the measured take; None if no model was edited.
     """

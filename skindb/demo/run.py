@@ -12,7 +12,7 @@ from skindb.demo.report import PLOTS, VIEWER, Results, write_report
 from skindb.elementwise import thread_count
 from skindb.errors import require
 from skindb.export.bundle import export_bundle
-from skindb.files import make_private, private_file
+from skindb.files import Json, make_private, private_file
 from skindb.fit import compile_kernels
 from skindb.parameters import DemoParameters, FitParameters, SimulationParameters
 from skindb.render.photographs import compare_photographs
@@ -30,9 +30,7 @@ EDIT_CONDITION = "lotion"
 EDIT_AMOUNTS = (0.0, 0.25, 1.0)
 
 
-def run_demo(
-    out: Path, *, progress: Progress = silent, **options: Any
-) -> dict[str, Any]:
+def run_demo(out: Path, *, progress: Progress = silent, **options: Any) -> Json:
     """Capture virtual subjects, ingest, fit, analyse, edit, render and export them, and
     write report.html.
 
@@ -112,7 +110,7 @@ def _make_takes(
     return results
 
 
-def _studies(parameters: DemoParameters) -> dict[str, dict[str, Any]]:
+def _studies(parameters: DemoParameters) -> dict[str, Json]:
     """Names and parameters of the studies; traits need two takes."""
     studies = {
         "brdf": {"seed": parameters.seed},

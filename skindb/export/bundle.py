@@ -26,7 +26,7 @@ from skindb.export.scenes import (
     export_usd,
 )
 from skindb.export.textures import skin_of
-from skindb.files import filled_template, make_private, plain, private_file
+from skindb.files import Json, filled_template, make_private, plain, private_file
 from skindb.reflectance.brdf_files import write_merl, write_tables
 from skindb.reflectance.dictionary import Dictionary
 from skindb.reflectance.kinds import as_mixture
@@ -127,7 +127,7 @@ CONVENTIONS = {
 }
 
 
-Files = dict[str, dict[str, Any]]  # path -> what it holds, units, and more
+Files = dict[str, Json]  # path -> what it holds, units, and more
 
 
 def export_bundle(
@@ -237,7 +237,7 @@ def _write_parts(
     return files
 
 
-def _held(holds: str, units: str, **more: Any) -> dict[str, Any]:
+def _held(holds: str, units: str, **more: Any) -> Json:
     """Description of a file."""
     return {"holds": holds, "units": units, **more}
 
@@ -290,7 +290,7 @@ def _write_bases(basis: xr.Dataset, folder: Path, merl: bool) -> Files:
     return files
 
 
-def _manifest(model: xr.DataTree, folder: Path, files: Files) -> dict[str, Any]:
+def _manifest(model: xr.DataTree, folder: Path, files: Files) -> Json:
     attrs = model.attrs
     fitted = model["fitted"].to_dataset()
     return {
@@ -329,7 +329,7 @@ def _missing(model: xr.DataTree, files: Files) -> list[str]:
     return missing
 
 
-def _errors(fitted: xr.Dataset) -> dict[str, Any]:
+def _errors(fitted: xr.Dataset) -> Json:
     """Median and 95 % quantile over fitted surfels of every quality measure, and the
     fraction of each status.
     """
@@ -339,7 +339,7 @@ def _errors(fitted: xr.Dataset) -> dict[str, Any]:
         if fraction := float((status == member).mean()):
             about = {"fraction": fraction, "meaning": member.explanation}
             fractions[member.name.lower()] = about
-    report: dict[str, Any] = {"surfels": status.size, "status_fraction": fractions}
+    report: Json = {"surfels": status.size, "status_fraction": fractions}
     for name in names_of(Use.EXPORTED):
         values = fitted[name].values if name in fitted else np.zeros(0)
         finite = values[np.isfinite(values)]
@@ -353,7 +353,7 @@ def _errors(fitted: xr.Dataset) -> dict[str, Any]:
     return report
 
 
-def _sites(model: xr.DataTree) -> dict[str, Any]:
+def _sites(model: xr.DataTree) -> Json:
     """sigma_tr [mm^-1], its errors and its status per probe site and channel; empty
     without a probe.
     """
@@ -372,7 +372,7 @@ def _sites(model: xr.DataTree) -> dict[str, Any]:
     }
 
 
-def _fingerprint(path: Path) -> dict[str, Any]:
+def _fingerprint(path: Path) -> Json:
     with path.open("rb") as file:
         return {
             "sha256": hashlib.file_digest(file, "sha256").hexdigest(),

@@ -5,7 +5,6 @@ of the approximation.
 import json
 import struct
 from pathlib import Path
-from typing import Any
 
 import imagecodecs
 import numpy as np
@@ -14,7 +13,7 @@ import xarray as xr
 from skindb import __version__
 from skindb.export.inputs import describe_edit
 from skindb.export.textures import Shape, Skin, index_of, skin_of
-from skindb.files import private_file
+from skindb.files import Json, private_file
 from skindb.schema.consent import require_consent
 
 FLOAT = 5126
@@ -69,8 +68,8 @@ def export_gltf(
 
 
 def _document(
-    textures: dict[str, bytes], extras: dict[str, Any], skin: Skin
-) -> tuple[dict[str, Any], bytes]:
+    textures: dict[str, bytes], extras: Json, skin: Skin
+) -> tuple[Json, bytes]:
     """The JSON document of the scene, and the binary data to which it refers."""
     material = _material(extras, skin)
     # in all names, because programs merge what has the same name in several files
@@ -110,7 +109,7 @@ def _document(
 
 def _mesh_data(
     shape: Shape, views: list[dict[str, int]]
-) -> tuple[bytes, list[dict[str, Any]], dict[str, int]]:
+) -> tuple[bytes, list[Json], dict[str, int]]:
     """Binary data of the mesh, its accessors, and the accessor of each attribute; views
     of the data are appended to `views`.
     """
@@ -124,7 +123,7 @@ def _mesh_data(
         "indices": (indices, "SCALAR"),
     }
     body = b""
-    accessors: list[dict[str, Any]] = []
+    accessors: list[Json] = []
     for name, (array, kind) in arrays.items():
         is_index = name == "indices"
         accessors.append(
@@ -145,7 +144,7 @@ def _mesh_data(
     return body, accessors, attributes
 
 
-def _material(extras: dict[str, Any], skin: Skin) -> dict[str, Any]:
+def _material(extras: Json, skin: Skin) -> Json:
     pbr = {
         "baseColorTexture": {"index": 0},
         "metallicRoughnessTexture": {"index": 1},
@@ -170,7 +169,7 @@ def _material(extras: dict[str, Any], skin: Skin) -> dict[str, Any]:
     }
 
 
-def _extras(model: xr.DataTree, skin: Skin) -> dict[str, Any]:
+def _extras(model: xr.DataTree, skin: Skin) -> Json:
     return {
         "take": str(model.attrs.get("take", model.attrs.get("subject", "face"))),
         "source": "measured skin reflectance (Weyrich et al. 2005), approximated",
@@ -195,7 +194,7 @@ def _append(
     return body + data + b"\0" * (-len(data) % 4)
 
 
-def _glb(document: dict[str, Any], body: bytes) -> bytes:
+def _glb(document: Json, body: bytes) -> bytes:
     """Container of a JSON chunk and a binary chunk, each padded to four bytes (glTF
     2.0, section 4.4).
     """

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from skindb.errors import require
-from skindb.files import plain
+from skindb.files import Json, plain
 from skindb.optics.diffusion import dipole_s
 from skindb.render.surfels import with_matt_surfels
 from skindb.schema import check, variables
@@ -114,7 +114,7 @@ def required(model: xr.DataTree) -> xr.Dataset:
     return with_matt_surfels(fitted)
 
 
-def describe_edit(attrs: Mapping[Any, Any]) -> dict[str, Any] | None:
+def describe_edit(attrs: Mapping[Any, Any]) -> Json | None:
     """Origin of an edited model, the edit, and whose consent covers it; None if the
     model was not edited.
     """

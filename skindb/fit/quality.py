@@ -4,11 +4,10 @@ and status, samples that the model does not explain, and surfels with hidden ski
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import xarray as xr
 
+from skindb.files import Json
 from skindb.reflectance._lumitexel_kernels import BINS_PER_SCALE
 from skindb.schema import FitStatus, check, dataset, variables
 from skindb.schema.label import FACE
@@ -86,7 +85,7 @@ def prediction_table(fitted: xr.Dataset) -> xr.Dataset:
     )
 
 
-def describe_prediction(table: xr.Dataset) -> dict[str, Any]:
+def describe_prediction(table: xr.Dataset) -> Json:
     """The table as nested dicts, without what is empty: by region all surfels, by
     status all regions.
     """
@@ -102,7 +101,7 @@ def describe_prediction(table: xr.Dataset) -> dict[str, Any]:
     }
 
 
-def tabulate_prediction(described: dict[str, Any]) -> list[list[str]]:
+def tabulate_prediction(described: Json) -> list[list[str]]:
     """Header and rows of `describe_prediction` for a terminal: median / 95 %, in per cent."""
     kinds = [(samples, space) for samples in SAMPLES for space in SPACES]
     rows = [
@@ -157,9 +156,9 @@ def tabulate_diffuse(tables: xr.Dataset) -> list[list[str]]:
     return rows
 
 
-def _row(one: xr.Dataset) -> dict[str, Any]:
+def _row(one: xr.Dataset) -> Json:
     """Values of one region or status."""
-    row: dict[str, Any] = {"surfels": int(one["prediction_surfels"])}
+    row: Json = {"surfels": int(one["prediction_surfels"])}
     if row["surfels"]:
         row["fraction"] = float(one["prediction_fraction"])
     if np.isfinite(one["prediction_outlier_fraction"]):
@@ -254,7 +253,7 @@ def misfits(frames: AnyArray) -> dict[str, AnyArray]:
     }
 
 
-def suspects(outliers: xr.Dataset, lumitexels: xr.Dataset) -> list[dict[str, Any]]:
+def suspects(outliers: xr.Dataset, lumitexels: xr.Dataset) -> list[Json]:
     """Lights and cameras whose residuals are far above the usual ones, worst first.
 
     Lights at grazing angles have a larger misfit even without motion, so that a light
@@ -268,7 +267,7 @@ def suspects(outliers: xr.Dataset, lumitexels: xr.Dataset) -> list[dict[str, Any
         > MOVED_LIGHT_RATIO * _around(outliers, lumitexels["light_position"].values),
         "camera": _moved_cameras(outliers),
     }
-    devices: list[dict[str, Any]] = []
+    devices: list[Json] = []
     for dim, named in moved.items():
         misfit = outliers[f"{dim}_misfit"].values
         share = outliers[f"{dim}_outlier_fraction"].values

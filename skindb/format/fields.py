@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skindb.errors import Fault, InputError, printable
-from skindb.files import json_depth, read_regular
+from skindb.files import Json, json_depth, read_regular
 from skindb.limits import (
     MAX_FRAME_SIDE_PX,
     MAX_JSON_BYTES,
@@ -75,7 +75,7 @@ class Fields:
                     f"correct it, see {page}",
                 )
             )
-        self.data: dict[str, Any] = data if self.is_object else {}
+        self.data: Json = data if self.is_object else {}
 
     def place(self, key: str) -> str:
         """Location of `key` in a message."""
@@ -107,7 +107,7 @@ class Fields:
         """The JSON object under a key."""
         return Fields(self.get(key, default), self.place(key), self.faults, self.page)
 
-    def rest(self) -> dict[str, Any]:
+    def rest(self) -> Json:
         """Keys that were not read, with their values; they are kept as attributes."""
         return {key: value for key, value in self.data.items() if key not in self.used}
 
@@ -405,7 +405,7 @@ def read_json(path: Path, faults: list[Fault]) -> Any:
 
 def _unique_pairs(
     pairs: list[tuple[str, Any]], where: str, faults: list[Fault]
-) -> dict[str, Any]:
+) -> Json:
     """The object of these pairs; repeated keys, and more than `MAX_OBJECT_KEYS`, are faults."""
     if len(pairs) > MAX_OBJECT_KEYS:
         rule = f"a JSON object must have at most {MAX_OBJECT_KEYS} keys"

@@ -8,11 +8,11 @@ import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from skindb.errors import Fault, InputError, attempt
+from skindb.files import Attributes, Json
 from skindb.format.contact_probe import ProbeRecord, read_probe
 from skindb.format.dome import DomeRecord, read_dome
 from skindb.format.fields import (
@@ -74,7 +74,7 @@ class Capture:
     condition: str
     visit: int | None  # None if capture.json states none
     repeat: int
-    traits: Mapping[str, Any]
+    traits: Attributes
     consent_scope: tuple[str, ...]
     consent_reference: str
     # name of the calibration in the database that applied; empty: the values of
@@ -82,7 +82,7 @@ class Capture:
     calibration: str
     scan_error: float  # RMS angle of the scan's normals to the true ones [degree]
     # confirmation of flashes above the limit for photosensitive seizures; may be empty
-    override: Mapping[str, Any]
+    override: Attributes
     mesh_file: Path | None
     # without vertices if there is no scan: ingest makes them from the photographs
     scan: Scan
@@ -92,13 +92,13 @@ class Capture:
     dome: DomeRecord | None
     probe: ProbeRecord | None
     json_files: tuple[Path, ...]
-    attributes: Mapping[str, Any]  # keys that the format does not define
+    attributes: Attributes  # keys that the format does not define
     # those to report, with the key that may have been intended
     unknown_keys: tuple[str, ...]
     skipped: tuple[str, ...]  # missing parts, and the results that depend on them
     crop: Crop | None = None  # limits of the scan
     # version of the calibration that provides its lights
-    calibrated_by: Mapping[str, Any] | None = None
+    calibrated_by: Attributes | None = None
 
     @property
     def has_scan(self) -> bool:
@@ -161,7 +161,7 @@ def read_capture(path: str | Path, *, crop: Crop | None = None) -> Capture:
     return capture
 
 
-def record_faults(record: Mapping[str, Any]) -> list[Fault]:
+def record_faults(record: Attributes) -> list[Fault]:
     """Faults that `read_capture` would report for the values of `capture.json` that are
     not file names.
     """
@@ -224,10 +224,10 @@ class _Reader:
             crop=self.crop,
         )
 
-    def person(self) -> dict[str, Any]:
+    def person(self) -> Json:
         """Subject, session and consent: the values of `capture.json` that are not file names."""
         fields = self.fields
-        record: dict[str, Any] = {
+        record: Json = {
             "subject": fields.text("subject", rule=NAME),
             "condition": fields.text("condition", rule=NAME, default="normal"),
             "session": fields.text("session"),
@@ -284,7 +284,7 @@ class _Reader:
         data = read_json(path, self.faults)
         return None if data is None else Fields(data, str(path), self.faults)
 
-    def _traits(self) -> dict[str, Any]:
+    def _traits(self) -> Json:
         traits = self.fields.object("traits", {})
         traits.at_most(MAX_OBJECT_KEYS, "traits")
         for name, value in traits.data.items():
@@ -319,7 +319,7 @@ class _Reader:
             )
         return scope, consent.text("reference")
 
-    def _override(self) -> dict[str, Any]:
+    def _override(self) -> Json:
         """The operator's confirmation of flashes above the limit, which is valid only
         if it is complete.
         """
@@ -554,7 +554,7 @@ class _Reader:
         return dome
 
     def _require_sites(
-        self, landmarks: Mapping[str, Any], regions: Mapping[str, Index]
+        self, landmarks: Attributes, regions: Mapping[str, Index]
     ) -> None:
         """Check that every site of the probe has a position: a landmark, or a non-empty
         region of its name.

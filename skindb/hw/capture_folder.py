@@ -24,7 +24,7 @@ from skindb.errors import (
     require,
     require_none,
 )
-from skindb.files import Json, make_private, private_file
+from skindb.files import Attributes, Json, make_private, private_file
 from skindb.format.dome import CameraRecord, DomeRecord
 from skindb.format.fields import Fields, read_json
 from skindb.format.frames import (
@@ -51,15 +51,15 @@ class Unfinished:
 
     folder: Path
     # values that must not change between the sessions of a capture
-    identity: dict[str, Any]
+    identity: Json
     # complete steps, as dome.json keeps them
-    sequence: list[dict[str, Any]] = field(default_factory=list)
+    sequence: list[Json] = field(default_factory=list)
     # complete placements of the probe
-    sites: list[dict[str, Any]] = field(default_factory=list)
+    sites: list[Json] = field(default_factory=list)
     # the confirmation for the session with the most flashes per second
-    override: dict[str, Any] | None = None
+    override: Json | None = None
     flashes_per_second: int = 0  # of the session with the most
-    running: dict[str, Any] | None = None  # steps that are running, see `begin_run`
+    running: Json | None = None  # steps that are running, see `begin_run`
 
     @property
     def started(self) -> bool:
@@ -82,7 +82,7 @@ class Unfinished:
             os.fsync(file.fileno())
         temporary.replace(self.folder / UNFINISHED)
 
-    def count(self, flashes: int, override: Mapping[str, Any] | None) -> None:
+    def count(self, flashes: int, override: Attributes | None) -> None:
         """Record, before a session begins, its flashes per second and their confirmation."""
         if flashes > self.flashes_per_second:
             self.flashes_per_second = flashes
@@ -105,7 +105,7 @@ class Unfinished:
         return schedule, float(self.running["started"])
 
 
-def open_unfinished(folder: Path, identity: Mapping[str, Any]) -> Unfinished:
+def open_unfinished(folder: Path, identity: Attributes) -> Unfinished:
     """Begin a capture in a new folder, or resume an unfinished one of the same subject.
 
     Parameters
@@ -169,9 +169,7 @@ def _read(folder: Path, path: Path, note: Any) -> Unfinished:
     return begun
 
 
-def _require_same(
-    folder: Path, before: Mapping[str, Any], now: Mapping[str, Any]
-) -> None:
+def _require_same(folder: Path, before: Attributes, now: Attributes) -> None:
     """Refuse to mix subjects, or frames under different conditions."""
     faults = []
     for name in {**before, **now}:
@@ -232,9 +230,9 @@ class Subject:
 
     subject: str
     session: str
-    consent: Mapping[str, Any]
+    consent: Attributes
     condition: str = "normal"
-    traits: Mapping[str, Any] = field(default_factory=dict)
+    traits: Attributes = field(default_factory=dict)
     calibration: str = ""  # name of the calibration that ingest reads from the database
     virtual: str = ""  # virtual subject of a rehearsal; empty in a real session
 
@@ -247,8 +245,8 @@ class Setup:
 
     folder: Path
     dome: DomeRecord
-    record: Mapping[str, Any]  # content of dome.json
-    probe: Mapping[str, Any] | None  # content of probe.json
+    record: Attributes  # content of dome.json
+    probe: Attributes | None  # content of probe.json
     brackets: Mapping[str, float]  # id of an exposure of the probe -> seconds
 
 
@@ -274,7 +272,7 @@ def read_setup(folder: Path) -> Setup:
     return Setup(folder, dome, record, probe, brackets)
 
 
-def identity(setup: Setup, subject: Subject) -> dict[str, Any]:
+def identity(setup: Setup, subject: Subject) -> Json:
     """Record that must be the same in all sessions of a capture."""
     record = {
         "subject": subject.subject,
@@ -303,9 +301,7 @@ def require_space(folder: Path, setup: Setup, steps: int) -> None:
     )
 
 
-def remaining_schedule(
-    schedule: Schedule, entries: Sequence[Mapping[str, Any]]
-) -> Schedule:
+def remaining_schedule(schedule: Schedule, entries: Sequence[Attributes]) -> Schedule:
     """Steps of a schedule that are not among these entries, with the intervals of the schedule."""
     complete = {(entry["light"], entry["exposure"]) for entry in entries}
     remaining = [
@@ -459,7 +455,7 @@ def write_capture(
     (out / UNFINISHED).unlink()
 
 
-def capture_record(subject: Subject) -> dict[str, Any]:
+def capture_record(subject: Subject) -> Json:
     """Content of capture.json that describes the subject."""
     record = {
         "format": "skindb-capture",
@@ -477,7 +473,7 @@ def capture_record(subject: Subject) -> dict[str, Any]:
     return record
 
 
-def _write_probe(session: Unfinished, probe: Mapping[str, Any]) -> None:
+def _write_probe(session: Unfinished, probe: Attributes) -> None:
     placements: dict[str, Json] = {}  # site -> number -> log of the pressure
     for entry in session.sites:
         numbers = placements.setdefault(str(entry["site"]), {})
@@ -517,7 +513,7 @@ def copy_frame(path: Path, target: Path) -> None:
         part.write_bytes(path.read_bytes())
 
 
-def write_record(path: Path, record: Mapping[str, Any]) -> None:
+def write_record(path: Path, record: Attributes) -> None:
     """Write a JSON file, and make its folder."""
     with _complete(path) as part:
         part.write_text(json.dumps(record, indent=1), encoding="utf-8")

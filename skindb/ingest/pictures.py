@@ -6,7 +6,7 @@ import json
 import re
 import shutil
 import unicodedata
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -18,7 +18,7 @@ import numpy as np
 
 from skindb.calibration.mirror_ball import ball_outline, distant_light, highlight_centre
 from skindb.errors import Fault, attempt, few_names, require, require_none
-from skindb.files import make_private, private_file, read_regular
+from skindb.files import Attributes, Json, make_private, private_file, read_regular
 from skindb.format.dome import EXPOSURE_RATIO
 from skindb.format.fields import IDENTIFIER, Fields, short
 from skindb.format.folder import FORMAT, record_faults
@@ -70,7 +70,7 @@ class Imported:
 def import_images(
     source: str | Path,
     out: str | Path,
-    person: Mapping[str, Any],
+    person: Attributes,
     *,
     progress: Progress = silent,
     **parameters: Any,
@@ -153,7 +153,7 @@ def import_images(
 def import_olat(
     source: str | Path,
     out: str | Path,
-    person: Mapping[str, Any],
+    person: Attributes,
     *,
     progress: Progress = silent,
     **parameters: Any,
@@ -207,9 +207,7 @@ def import_olat(
     return Imported(out, len(table), len(devices), notes)
 
 
-def _parameters(
-    values: Mapping[str, Any], source: str, *foreign: str
-) -> ImportParameters:
+def _parameters(values: Attributes, source: str, *foreign: str) -> ImportParameters:
     """The parameters of an import, none of which belongs to other sources."""
     paths = ("lights", "mirror_ball", "mask", "cameras", "scan")
     stated = {n: Path(values[n]) for n in paths if values.get(n) is not None}
@@ -300,7 +298,7 @@ class _Frames:
         self,
         file: Path,
         light: str,
-        camera: dict[str, Any],
+        camera: Json,
         inside: Mask | None = None,
     ) -> None:
         """Write a frame, black outside a mask; the first frame of a camera determines
@@ -358,8 +356,8 @@ class _Frames:
 
     def finish(
         self,
-        person: Mapping[str, Any],
-        cameras: list[dict[str, Any]],
+        person: Attributes,
+        cameras: list[Json],
         lights: Sequence[Light],
         ids: Sequence[str],
         scan: Path | None = None,
@@ -606,7 +604,7 @@ def _ids(names: Sequence[str]) -> list[str]:
     return [f"l{k:03d}" for k in range(len(names))]
 
 
-def _distant_camera(width: int, height: int, width_mm: float) -> dict[str, Any]:
+def _distant_camera(width: int, height: int, width_mm: float) -> Json:
     """A camera whose picture is `width_mm` wide at the origin: x right, y up, z to it."""
     focal = CAMERA_DISTANCE_MM * width / width_mm
     return {
@@ -621,7 +619,7 @@ def _distant_camera(width: int, height: int, width_mm: float) -> dict[str, Any]:
 
 def _light_records(
     lights: Sequence[Light], ids: Sequence[str], white: float
-) -> list[dict[str, Any]]:
+) -> list[Json]:
     """Lights of dome.json; a facing surface of R_d 0.5 is as bright as `white`."""
     near = [float(np.linalg.norm(x.vector)) for x in lights if not x.distant]
     square = float(np.median(near)) ** 2 if near else 1.0
@@ -695,13 +693,13 @@ def _olat_files(
     return pattern, files
 
 
-def _record(person: Mapping[str, Any], time: datetime) -> dict[str, Any]:
+def _record(person: Attributes, time: datetime) -> Json:
     """Content of capture.json."""
     session = time.isoformat(timespec="seconds")
     return {"format": FORMAT, "version": 2, "session": session, **person}
 
 
-def _require_writable(out: Path, person: Mapping[str, Any]) -> None:
+def _require_writable(out: Path, person: Attributes) -> None:
     """Require a record without faults, and a folder that does not exist."""
     require_none(record_faults(_record(person, datetime.now(UTC))))
     require(

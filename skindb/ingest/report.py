@@ -4,7 +4,6 @@ surfel, region, camera and light.
 """
 
 import hashlib
-from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb.files import file_digest
+from skindb.files import Attributes, Json, file_digest
 from skindb.format.dome import DomeRecord
 from skindb.format.folder import WHOLE_SURFACE, Capture
 from skindb.format.frames import Digests
@@ -26,8 +25,8 @@ COLUMNS = ("mean", *QUANTILES, "seen")
 
 
 def capture_provenance(
-    capture: Capture, parameters: Mapping[str, Any], digests: Digests
-) -> dict[str, Any]:
+    capture: Capture, parameters: Attributes, digests: Digests
+) -> Json:
     """Attributes of the version's root and its record; paths are those inside the folder.
 
     `digests` are those of the frames read so far. The digest of all frames is computed
@@ -89,7 +88,7 @@ def _files(capture: Capture) -> list[Path]:
     return [*capture.json_files, *sorted(file for file in files if file is not None)]
 
 
-def cleaning_lines(provenance: Mapping[str, Any], *, places: bool) -> list[str]:
+def cleaning_lines(provenance: Attributes, *, places: bool) -> list[str]:
     """A line for every kind of repair, optionally with the `places` of the first ones,
     x y z in mm.
     """
@@ -106,7 +105,7 @@ def cleaning_lines(provenance: Mapping[str, Any], *, places: bool) -> list[str]:
 
 def describe_samples(
     lumitexels: Lumitexels, surfels: SurfelSet, dome: DomeRecord
-) -> dict[str, Any]:
+) -> Json:
     """Samples per sampled surfel and fraction of sampled surfels, also by region;
     devices without samples.
     """
@@ -126,7 +125,7 @@ def describe_samples(
     }
 
 
-def sample_lines(samples: Mapping[str, Any]) -> list[str]:
+def sample_lines(samples: Attributes) -> list[str]:
     """Summary of the samples, and a line for every camera and light without a sample."""
     face = samples["parts"][WHOLE_SURFACE]
     quantiles = ", ".join(f"{name} {face[name]:,}" for name in QUANTILES)
@@ -181,7 +180,7 @@ def calibration_table(calibration: xr.Dataset) -> list[list[Any]]:
     return rows
 
 
-def sample_table(samples: Mapping[str, Any]) -> list[list[Any]]:
+def sample_table(samples: Attributes) -> list[list[Any]]:
     """Header and rows: samples per surfel, by region."""
     rows = [
         [name, *(part[column] for column in COLUMNS)]

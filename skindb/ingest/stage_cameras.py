@@ -2,18 +2,17 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from scipy.spatial.transform import Rotation
 
 from skindb.errors import Fault, InputError, input_error, require, require_none
-from skindb.files import read_regular
+from skindb.files import Json, read_regular
 from skindb.format.fields import Fields, read_json, short
 from skindb.ingest.light_tables import numbers
 from skindb.limits import MAX_CAMERAS, MAX_SCAN_BYTES
 
 
-def read_cameras(source: Path, given: Path | None) -> list[dict[str, Any]]:
+def read_cameras(source: Path, given: Path | None) -> list[Json]:
     """Cameras of a JSON file, or of the text files of COLMAP."""
     path = given or (
         source / "cameras.json" if (source / "cameras.json").exists() else source
@@ -41,7 +40,7 @@ def read_cameras(source: Path, given: Path | None) -> list[dict[str, Any]]:
     ]
 
 
-def _colmap_cameras(folder: Path) -> list[dict[str, Any]]:
+def _colmap_cameras(folder: Path) -> list[Json]:
     """Cameras of cameras.txt and images.txt; images are named after the cameras."""
     tables = {name: folder / f"{name}.txt" for name in ("cameras", "images")}
     require(
@@ -53,7 +52,7 @@ def _colmap_cameras(folder: Path) -> list[dict[str, Any]]:
     )
     place = str(tables["cameras"])
     lenses = {}
-    found = list[dict[str, Any]]()
+    found = list[Json]()
     try:
         lines = {
             name: [
@@ -93,7 +92,7 @@ def _colmap_cameras(folder: Path) -> list[dict[str, Any]]:
     return found
 
 
-def _colmap_lens(model: str, v: Sequence[float], place: str) -> dict[str, Any]:
+def _colmap_lens(model: str, v: Sequence[float], place: str) -> Json:
     """K and distortion k1 k2 p1 p2 k3 of a camera model of COLMAP."""
     if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
         focal, cx, cy, *radial = v

@@ -10,14 +10,13 @@ import hashlib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
-from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from skindb.cache import cached_arrays
 from skindb.errors import input_error
-from skindb.files import package_json
+from skindb.files import Json, package_json
 from skindb.optics.angles import directions, half_difference
 from skindb.optics.fresnel import fresnel_reflectance
 from skindb.reflectance import _row_kernels
@@ -91,11 +90,11 @@ class Dictionary:
         return hashlib.sha256(np.ascontiguousarray(self.table).data).hexdigest()
 
     @property
-    def provenance(self) -> dict[str, Any]:
+    def provenance(self) -> Json:
         """Source and digest, which is the same for lights of all sizes; for dictionaries
         from files also notes, and the digests of the files.
         """
-        provenance: dict[str, Any] = {
+        provenance: Json = {
             "dictionary": self.source,
             "dictionary_digest": self.point_digest or self.digest,
         }

@@ -24,7 +24,7 @@ from zarr.abc.store import ByteRequest, Store
 from zarr.core.buffer import Buffer, BufferPrototype
 
 from skindb.errors import InputError, UnavailableError, input_error, require
-from skindb.files import cache_folder, make_private
+from skindb.files import Json, cache_folder, make_private
 from skindb.limits import MAX_STORE_JSON_BYTES
 from skindb.store.folder import Folder
 from skindb.store.place import (
@@ -389,7 +389,7 @@ class Bucket:
             lambda: self._store.put(path, data, use_multipart=False)["e_tag"] or "",
         )
 
-    def _objects(self, key: str) -> dict[str, Any]:
+    def _objects(self, key: str) -> Json:
         """Metadata of every object below a key, by its path relative to the key."""
         path = self._path(key)
         listing = self._ask(

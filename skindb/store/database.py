@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import pandas as pd
 from xarray import Dataset, DataTree
 
 from skindb.errors import Fault, InputError, input_error, require
-from skindb.files import Json, make_private
+from skindb.files import Attributes, Json, make_private
 from skindb.schema.consent import CONSENT, require_consent
 from skindb.store.archive import Archive
 from skindb.store.arrays import open_version
@@ -438,7 +438,7 @@ class Database:
         """
         return create_release(self.place, name, takes)
 
-    def commit_release(self, name: str, pins: Iterable[Mapping[str, Any]]) -> Record:
+    def commit_release(self, name: str, pins: Iterable[Attributes]) -> Record:
         """Commit the next revision of a release, which names these versions; prefer
         `create_release`.
         """

@@ -17,7 +17,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.errors import require
-from skindb.files import make_private, private_file
+from skindb.files import Json, make_private, private_file
 from skindb.geometry.rays import RayScene
 from skindb.optics.diffusion import dipole_s
 from skindb.parameters import CONDITIONS, SimulationParameters
@@ -84,7 +84,7 @@ def session_time(person: Person) -> datetime:
     )
 
 
-def capture_record(person: Person, *, contact: bool, landmarks: bool) -> dict[str, Any]:
+def capture_record(person: Person, *, contact: bool, landmarks: bool) -> Json:
     """capture.json."""
     traits = {
         "age": person.age,
@@ -118,7 +118,7 @@ def capture_record(person: Person, *, contact: bool, landmarks: bool) -> dict[st
     return record
 
 
-def dome_record(dome: Dome, sensor: Sensor, start: datetime) -> dict[str, Any]:
+def dome_record(dome: Dome, sensor: Sensor, start: datetime) -> Json:
     """Content of dome/dome.json, without the intensities of the lights, which the white
     target determines.
     """
@@ -175,14 +175,14 @@ def dome_record(dome: Dome, sensor: Sensor, start: datetime) -> dict[str, Any]:
     }
 
 
-def _polariser(device: DomeCamera | DomeLight) -> dict[str, Any]:
+def _polariser(device: DomeCamera | DomeLight) -> Json:
     """Keys of a light or camera with a polariser."""
     if device.polariser is None:
         return {}
     return {"polariser": device.polariser, "leak": LEAK}
 
 
-def _sequence(dome: Dome, start: datetime) -> list[dict[str, Any]]:
+def _sequence(dome: Dome, start: datetime) -> list[Json]:
     """Lights one after the other at 12 Hz, once per exposure."""
     out = []
     for e, seconds in enumerate(SECONDS):
@@ -371,7 +371,7 @@ def _write_truth(
     subsurface: bool,
 ) -> None:
     """Write the true parameters of the take at the vertices of the true surface."""
-    touched: dict[str, Any] = {}
+    touched: Json = {}
     if probe is not None:
         touched = {"probe_distance": probe.distance, "probe_profile": probe.profile}
     for name in SITE_TRUTH:

@@ -3,11 +3,10 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 
-from skindb.files import package_json
+from skindb.files import Json, package_json
 from skindb.parameters import CONDITIONS
 from skindb.schema.cohort import take_name
 from skindb.virtual.face import FaceShape
@@ -184,9 +183,9 @@ def face_shape(person: Person) -> FaceShape:
 
 
 @cache
-def _tables() -> dict[str, Any]:
+def _tables() -> Json:
     """Subjects of the demo, the paper's table 1 (subject of dataset A, groups of dataset
     B), and the terms of a linear model of the shape of faces.
     """
-    tables: dict[str, Any] = package_json("skindb.virtual", "person.json")
+    tables: Json = package_json("skindb.virtual", "person.json")
     return tables

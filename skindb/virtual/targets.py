@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,7 +20,7 @@ from skindb.calibration.boards import printed_board
 from skindb.calibration.cameras import chart_reference
 from skindb.calibration.setup import chart_places
 from skindb.errors import require
-from skindb.files import make_private, private_file
+from skindb.files import Json, make_private, private_file
 from skindb.format.dome import DomeRecord
 from skindb.types import Float64, Values16, lengths, unit
 from skindb.virtual.capture import DEVICE_SEED, dome_record
@@ -66,7 +65,7 @@ def write_laboratory(
         "cameras": ("id", "width", "height", "bit_depth", "black_level", "white_level"),
         "lights": ("id", "disc_radius"),
     }
-    record: dict[str, Any] = {
+    record: Json = {
         key: [{name: item[name] for name in names} for item in complete[key]]
         for key, names in stated.items()
     }
@@ -263,7 +262,7 @@ def _reflectance(place: Float64, kind: str, number: int) -> Float64:
 @cache
 def _board_picture() -> Float64:
     """The printed board, 0.04 where it is black and 0.9 where it is white."""
-    record: dict[str, Any] = BOARD
+    record: Json = BOARD
     size = [round(n * record["square"] * BOARD_PX_MM) for n in record["squares"]]
     drawn = printed_board(**record).generateImage(size, marginSize=0)
     return 0.04 + 0.86 * np.asarray(drawn, float) / 255

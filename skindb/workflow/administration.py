@@ -17,7 +17,7 @@ import skindb
 from skindb import __version__, store
 from skindb.clock import utc_time
 from skindb.errors import Fault, InputError, few_names, require_none
-from skindb.files import private_file
+from skindb.files import Json, private_file
 from skindb.store import (
     CALIBRATION,
     RELEASE,
@@ -329,7 +329,7 @@ def _erase_from_backups(
     return tuple(erased), faults
 
 
-def erasure_report(withdrawal: Withdrawal) -> dict[str, Any]:
+def erasure_report(withdrawal: Withdrawal) -> Json:
     """A report of a withdrawal that can be handed out: it contains no pseudonym,
     attribute, name or path.
     """

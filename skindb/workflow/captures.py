@@ -345,8 +345,8 @@ def calibrate(
     key = require_text(name, NAME.pattern, "name of a calibration")
     require_kind_of_calibration(db, key, rig=False)
     folder = Path(setup)
-    geometry = dict[str, Any]()
-    cameras = dict[str, Any]()
+    geometry = Json()
+    cameras = Json()
     if (folder / BOARDS).is_file():
         geometry, cameras = measured_cameras(folder)
         geometry = with_placeholders(geometry)

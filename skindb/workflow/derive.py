@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import ast
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
@@ -24,7 +24,7 @@ import numpy as np
 from xarray import Dataset, DataTree
 
 from skindb.cache import cached_arrays
-from skindb.files import ROOT, package_digest, plain
+from skindb.files import ROOT, Attributes, Json, package_digest, plain
 from skindb.store import STUDY, SUMMARY, Database, Lease, Record
 
 PACKAGE = "skindb"
@@ -204,7 +204,7 @@ class Derivation:
     db: Database
     kind: str
     key: str
-    provenance: Mapping[str, Any] = field(repr=False)
+    provenance: Attributes = field(repr=False)
     names: frozenset[str] = frozenset()
 
     @classmethod
@@ -263,7 +263,7 @@ class Derivation:
         with self.db.stage(self.kind, self.key, lease, names=self.names) as stage:
             stage.write(groups, tables=tables)
             attrs["study" if self.kind == STUDY else "take"] = self.key
-            defaults: dict[str, Any] = {"parameters": {}, "seeds": {}}
+            defaults: Json = {"parameters": {}, "seeds": {}}
             return stage.commit({**defaults, **attrs, **self.provenance})
 
 

@@ -14,7 +14,7 @@ from skindb.analysis.brdf import population_basis
 from skindb.analysis.edit import apply_traits, with_basis
 from skindb.analysis.summary import SAMPLED, common_maps
 from skindb.errors import require
-from skindb.files import plain
+from skindb.files import Json, plain
 from skindb.reflectance.dictionary import embedded_dictionary
 from skindb.reflectance.kinds import require_mixture
 from skindb.render.figures import write_grid
@@ -304,7 +304,7 @@ def editable_model(
 
 def _registered_textures(
     db: Database, take: str, model: DataTree, vectors: DataTree
-) -> tuple[dict[str, Any], list[Record]]:
+) -> tuple[Json, list[Record]]:
     """What moves the texture of a registered take: arguments of `apply_traits`, and the
     record of its registration; nothing for other takes.
     """

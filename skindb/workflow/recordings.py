@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -327,7 +326,7 @@ def _written(
     suffix = next(out.glob(f"{first}.*")).suffix
     frames = {"frames": f"{TEMPLATES[kind]}{suffix}"}
     file = out / (NEEDED[kind][0] if kind in NEEDED else setup.FILE)
-    record: dict[str, Any] = read_json(file, []) if file.is_file() else {}
+    record: Json = read_json(file, []) if file.is_file() else {}
     if kind == "board":
         record |= frames | {"poses": places, "cameras": cameras}
     elif kind == "white":

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from skindb.clock import SYSTEM_CLOCK, Clock, SimulatedClock, utc_time
 from skindb.errors import Fault, input_error, require_none
@@ -237,7 +236,7 @@ def real_session_faults(
 def _subject_faults(parameters: SessionParameters) -> list[Fault]:
     """Faults of the parameters that describe the subject, by the rules of ingest."""
     faults = list[Fault]()
-    traits = dict[str, Any]()
+    traits = Json()
     for text in parameters.traits:
         name, equals, _ = text.partition("=")
         if name and equals:
@@ -352,7 +351,7 @@ def _subject(parameters: SessionParameters, laboratory: Laboratory | None) -> Su
 
 def _traits(texts: Iterable[str]) -> Json:
     """Attributes given as NAME=VALUE, where a value is a number, true or false, or text."""
-    traits = dict[str, Any]()
+    traits = Json()
     for text in texts:
         name, _, value = text.partition("=")
         try:
