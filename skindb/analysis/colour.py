@@ -113,5 +113,5 @@ def _positive(reflectance: Array) -> Array:
 
 
 def _log10(values: Array) -> Array:
-    logarithm: Array = np.log10(values)
+    logarithm = np.log10(values)
     return logarithm

@@ -246,7 +246,7 @@ def plot_coverage(report: Dataset, *, ax: Axes | None = None) -> Axes:
     """
     from matplotlib.colors import LogNorm
 
-    cells: list[Words] = [tuple(name.split(AND)) for name in report["cell"].values]
+    cells = [tuple(name.split(AND)) for name in report["cell"].values]
     numbers = report[variables.COVERAGE_COUNT].values.tolist()
     count_of = dict(zip(map(frozenset, cells), numbers, strict=True))
     bands: list[Words] = [

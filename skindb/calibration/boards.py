@@ -82,7 +82,7 @@ def read_boards(folder: Path) -> Boards:
     require_none(faults)
     board = printed_board(squares.tolist(), square, marker, name)
     detector = cv2.aruco.CharucoDetector(board)
-    views: Views = {}
+    views = {}
     sizes = dict[str, tuple[int, int]]()
     for camera in cameras:
         for pose in range(1, count + 1):

@@ -493,7 +493,7 @@ def calibrate_positions(dome: DomeRecord, ball: BallFrames) -> xr.Dataset:
 
 def _highlights(dome: DomeRecord, ball: BallFrames, light: LightRecord) -> Highlights:
     """Highlights of a light, in the outline of the ball or, without any, in the whole picture."""
-    found: Highlights = {}
+    found = {}
     for place, circles in ball.outlines.items():
         for camera in dome.cameras:
             if circles and camera.id not in circles:

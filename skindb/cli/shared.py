@@ -163,7 +163,7 @@ def each_take(
         Called in this process with each result; returns its name, what --json prints of
         it, and lines to print.
     """
-    results: Json = {}
+    results = {}
     faults = []
     workers = asked("workers") or 1
     # so that the running take is known

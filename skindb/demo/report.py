@@ -81,7 +81,7 @@ def write_report(path: Path, results: Results, *, progress: Progress) -> Path:
         for comparison in compared
         if comparison.held_out
     ]
-    content: Json = {
+    content = {
         "version": __version__,
         "viewer": VIEWER,
         "minutes": (time.monotonic() - results.began) / 60,

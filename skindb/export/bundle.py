@@ -339,7 +339,7 @@ def _errors(fitted: xr.Dataset) -> Json:
         if fraction := float((status == member).mean()):
             about = {"fraction": fraction, "meaning": member.explanation}
             fractions[member.name.lower()] = about
-    report: Json = {"surfels": status.size, "status_fraction": fractions}
+    report = {"surfels": status.size, "status_fraction": fractions}
     for name in names_of(Use.EXPORTED):
         values = fitted[name].values if name in fitted else np.zeros(0)
         finite = values[np.isfinite(values)]

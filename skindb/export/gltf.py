@@ -123,7 +123,7 @@ def _mesh_data(
         "indices": (indices, "SCALAR"),
     }
     body = b""
-    accessors: list[Json] = []
+    accessors = []
     for name, (array, kind) in arrays.items():
         is_index = name == "indices"
         accessors.append(

@@ -206,7 +206,7 @@ def _layers(fitted: xr.Dataset, triangles: AnyArray) -> dict[str, Layer]:
     """
     shading = fitted[variables.SHADING_NORMAL].values
     axes = _surfel_axes(fitted, triangles)
-    layers: dict[str, Layer] = {
+    layers = {
         "albedo": (
             even_diffuse(fitted),
             "1",

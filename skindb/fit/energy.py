@@ -132,7 +132,7 @@ def without_even_reflection(
     eta = float(fitted[variables.REFRACTIVE_INDEX])
     surface = fitted[variables.SURFACE_REFLECTANCE].values[good]
     seen = float(np.average(surface, weights=area)) if good.any() else np.nan
-    summary: dict[str, Any] = {"highlights": seen}
+    summary = {"highlights": seen}
     even, error = 0.0, UNKNOWN_ERROR
     if leak is not None:
         error *= leak

@@ -72,7 +72,7 @@ def lumitexels(capture: xr.DataTree) -> xr.Dataset:
     InputError
         With every variable that is absent or does not fit the schema.
     """
-    parts: list[tuple[xr.Dataset, list[str]]] = []
+    parts = []
     faults: list[Fault] = []
     for group, required in REQUIRED.items():
         dataset = xr.Dataset()

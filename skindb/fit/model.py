@@ -122,7 +122,7 @@ def first_pass(
     parameters = parameters or FitParameters()
     timer = StageTimer(progress)
     samples = lumitexels(capture)
-    groups: dict[str, xr.Dataset] = {}
+    groups = {}
     with timer.stage("dictionary"):
         surface = surface_of(samples, parameters, dictionary)
         plan = plan_fit(capture, parameters, dictionary=dictionary)
@@ -386,7 +386,7 @@ def _report(fitted: xr.Dataset, held_out: xr.Dataset) -> dict[str, Any]:
         for m in FitStatus
         if (status == m).any()
     }
-    report: dict[str, Any] = {"surfels": int(status.size), "status": fractions}
+    report = {"surfels": int(status.size), "status": fractions}
     for name in names_of(Use.REPORTED):
         if name not in fitted:
             continue

@@ -267,7 +267,7 @@ def suspects(outliers: xr.Dataset, lumitexels: xr.Dataset) -> list[Json]:
         > MOVED_LIGHT_RATIO * _around(outliers, lumitexels["light_position"].values),
         "camera": _moved_cameras(outliers),
     }
-    devices: list[Json] = []
+    devices = []
     for dim, named in moved.items():
         misfit = outliers[f"{dim}_misfit"].values
         share = outliers[f"{dim}_outlier_fraction"].values

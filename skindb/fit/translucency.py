@@ -453,7 +453,7 @@ def summarise_translucency(sites: xr.Dataset) -> dict[str, dict[str, list[Any]]]
     status = sites["site_status"].values
     summary = {}
     for i, name in enumerate(names):
-        values: dict[str, list[Any]] = {
+        values = {
             key: [_number(x) for x in sites[var].values[i]] for key, var in keys.items()
         }
         summary[str(name)] = values | {

@@ -158,7 +158,7 @@ def _azimuth(fibre: Fields) -> float:
 
 def _check_frames(probe: ProbeRecord, fields: Fields) -> None:
     """Require that all frames have the size of the first one, and the declared depth."""
-    kind: FrameKind | None = None
+    kind = None
     views = [
         {SITE: site, EXPOSURE: exposure, PLACEMENT: placement}
         for site in (probe.sites if probe.frames else ())

@@ -468,7 +468,7 @@ def _decode_any_png(content: bytes) -> Frame:
 def _decode_tiff(path: Path, content: bytes) -> Frame:
     try:
         with tifffile.TiffFile(io.BytesIO(content)) as file:
-            page: Any = file.pages[0]
+            page = file.pages[0]
             values = np.asarray(page.asarray())
             if not _has_filters(page):
                 return values

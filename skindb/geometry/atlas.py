@@ -237,7 +237,7 @@ def _equalised(surface: Surface) -> list[tuple[Float64, float]]:
     weights = _mean_value_weights(points, faces)
     area = lengths(face_crosses(points, faces)) / 2
     around = np.bincount(faces.ravel(), np.repeat(area, 3), minlength=len(points))
-    maps: list[tuple[Float64, float]] = []
+    maps = []
     for _ in range(EQUALISATION_ROUNDS):
         uv = _solve(weights, surface.rim, surface.rim_uv)
         if uv is None:
@@ -463,7 +463,7 @@ def atlas_values(
     face, weight = raster
     known = float64(np.where(trust[:, None] > 0, values, 0))
     image = np.zeros((*face.shape, values.shape[1]), np.float32)
-    confidence: Image = np.zeros(face.shape, np.float32)
+    confidence = np.zeros(face.shape, np.float32)
     for start in range(0, len(face), TEXEL_ROWS):
         rows = slice(start, start + TEXEL_ROWS)
         corners = faces[face[rows]]  # of any triangle outside, where all weights are 0

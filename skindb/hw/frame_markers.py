@@ -87,7 +87,7 @@ def with_markers(schedule: Schedule, light: str, *, first: int = 0) -> Schedule:
     start = 0
     number = first
     begin = 0  # of the part
-    before: Step | None = None
+    before = None
     ends = [step.on_us for step in schedule.steps[1:]] + [schedule.steps[-1].off_us]
     for i, step in enumerate([*schedule.steps, None]):
         if (

@@ -13,7 +13,6 @@ from skindb.calibration.mirror_ball import highlight_of
 from skindb.errors import Fault, few_names
 from skindb.format.dome import CameraRecord
 from skindb.format.frames import read_frame
-from skindb.types import Float32
 
 THREADS = 2
 Taken = tuple[str, str, int]  # light, exposure, repeat
@@ -145,9 +144,7 @@ def _view(camera: CameraRecord, file: Path) -> _View:
     grey = np.asarray(frame.max(axis=-1), np.float32)
     sensor = camera.sensor
     white = sensor.white if np.isfinite(sensor.white) else float(grey.max())
-    level: Float32 = (grey - np.float32(sensor.black)) / np.float32(
-        white - sensor.black
-    )
+    level = (grey - np.float32(sensor.black)) / np.float32(white - sensor.black)
     low, middle, high = np.quantile(level, [0.02, 0.5, 0.98])
     steps = [np.abs(np.diff(level, axis=axis)).ravel() for axis in (0, 1)]
     steepest = np.quantile(np.concatenate(steps), SLOPE_QUANTILE)

@@ -94,7 +94,7 @@ class Spool:
         meta = np.empty((0, lights, cameras, 3), np.float16)
         chunks = (sizes, (lights,), (cameras,), (3,))
         name = f"spool-{uuid.uuid4().hex}"
-        lazy: da.Array = da.map_blocks(  # type: ignore[no-untyped-call]
+        lazy = da.map_blocks(  # type: ignore[no-untyped-call]
             shard, chunks=chunks, dtype=np.float16, meta=meta, name=name
         )
         return lazy

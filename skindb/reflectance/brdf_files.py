@@ -348,8 +348,8 @@ def read_merl_folder(path: str | Path) -> Dictionary:
     # centres of bins; theta_h is quadratic
     h, d, p = ((np.arange(n) + 0.5) / n for n in SHAPE)
     nodes = (h**2 * np.pi / 2, d * np.pi / 2, p * np.pi)
-    tables: list[Table] = []
-    origins: list[Origin] = []
+    tables = []
+    origins = []
     faults: list[Fault] = []
     for file in files:
         try:

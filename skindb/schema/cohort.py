@@ -407,7 +407,7 @@ class Stack:
 
     def _in_layout(self, values: Values) -> AnyArray:
         """Values of one take in the layout of the cohort."""
-        indices: list[list[int]] = []
+        indices = []
         extents = zip(
             VARIABLES[self.variable].dims, values.array.shape, self.size, strict=True
         )

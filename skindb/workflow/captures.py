@@ -216,8 +216,7 @@ def next_visits(db: Database, folders: Sequence[str | Path]) -> dict[Path, int]:
 
 def _session(db: Database, take: str) -> str | None:
     """Time of the session of the newest capture of a take."""
-    session: str | None = db.record("capture", take).provenance.get("session")
-    return session
+    return db.record("capture", take).provenance.get("session")
 
 
 def _ingest(

@@ -77,7 +77,7 @@ def measured_cameras(folder: Path) -> tuple[Json, Json]:
     require_none(faults)
     boards = read_boards(folder)
     cameras = boards_to_cameras(boards)
-    report: Json = {
+    report = {
         name: {
             "rms_px": one.rms,
             "poses": one.poses,

@@ -326,13 +326,13 @@ def _written(
     suffix = next(out.glob(f"{first}.*")).suffix
     frames = {"frames": f"{TEMPLATES[kind]}{suffix}"}
     file = out / (NEEDED[kind][0] if kind in NEEDED else setup.FILE)
-    record: Json = read_json(file, []) if file.is_file() else {}
+    record = read_json(file, []) if file.is_file() else {}
     if kind == "board":
         record |= frames | {"poses": places, "cameras": cameras}
     elif kind == "white":
         record["white"] = {"cameras": cameras} | record["white"] | frames
     else:
-        more: dict[str, Json] = {
+        more = {
             "dark": {"repeats": DARK_FRAMES},
             "flat": {"repeats": FLAT_FRAMES},
             "ball": {"places": places},
@@ -343,7 +343,7 @@ def _written(
     if kind in BRACKETED:
         record["exposures"] = [{"id": e, "seconds": s} for e, s in seconds.items()]
     write_record(file, record)
-    report: Json = {"path": str(out), "kind": kind, "places": places}
+    report = {"path": str(out), "kind": kind, "places": places}
     report["frames"] = sum(
         1 for _ in out.glob(re.sub(r"\{.*?\}", "*", TEMPLATES[kind]) + suffix)
     )

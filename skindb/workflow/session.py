@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from skindb.clock import SYSTEM_CLOCK, Clock, SimulatedClock, utc_time
+from skindb.clock import SYSTEM_CLOCK, SimulatedClock, utc_time
 from skindb.errors import Fault, input_error, require_none
 from skindb.files import Json, make_private, private_umask
 from skindb.format.fields import IDENTIFIER, read_json
@@ -391,7 +391,7 @@ def connected_devices(
     log = parameters.log
     if log is not None:
         make_private(log)
-    clock: Clock = SYSTEM_CLOCK
+    clock = SYSTEM_CLOCK
     watched = parameters.cameras
     if laboratory is not None:
         clock = laboratory.clock
