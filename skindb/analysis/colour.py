@@ -113,5 +113,4 @@ def _positive(reflectance: Array) -> Array:
 
 
 def _log10(values: Array) -> Array:
-    logarithm = np.log10(values)
-    return logarithm
+    return np.log10(values)

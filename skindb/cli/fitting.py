@@ -34,7 +34,6 @@ from skindb.cli.shared import (
     summary_of,
 )
 from skindb.cli.terminal import bar, echo
-from skindb.errors import Fault
 from skindb.files import Json
 from skindb.parameters import FitParameters
 
@@ -100,38 +99,29 @@ def fit(
         progress=progress,
     )
     finish = partial(_finished, database)
-    results: Json = {}
-    faults: list[Fault] = []
-    if chosen:
-        if not (asked("scheduler") or explain):
-            skindb.fit.compile_kernels(progress)
-        with workflow.logged_action(
-            database, "fit", chosen, arguments={"refit": refit, "explain": explain}
-        ):
-            results, faults = each_take(
-                call,
-                chosen,
-                shared=database.folder,
-                progress=progress,
-                finish=finish,
-            )
-    else:
-        echo(_nothing_to_fit(database, refit=refit), err=True)
-    emit(results, [], faults)
-
-
-def _nothing_to_fit(database: Database, *, refit: bool) -> str:
-    if not database.takes("capture"):
-        return "no captures: ingest some first"
-    if refit:
-        return (
-            "every take has a model with these parameters from this version of the "
-            "code; name takes to fit them anyway"
+    if not chosen:
+        line = (
+            "every take has a model of its newest capture; --refit fits again those "
+            "whose model would change"
         )
-    return (
-        "every take has a model of its newest capture; --refit fits again those whose "
-        "model would change"
-    )
+        if not database.takes("capture"):
+            line = "no captures: ingest some first"
+        elif refit:
+            line = (
+                "every take has a model with these parameters from this version of the "
+                "code; name takes to fit them anyway"
+            )
+        echo(line, err=True)
+        emit({}, [])
+        return
+    if not (asked("scheduler") or explain):
+        skindb.fit.compile_kernels(progress)
+    flags = {"refit": refit, "explain": explain}
+    with workflow.logged_action(database, "fit", chosen, arguments=flags):
+        results, faults = each_take(
+            call, chosen, shared=database.folder, progress=progress, finish=finish
+        )
+    emit(results, [], faults)
 
 
 def _finished(
@@ -177,10 +167,7 @@ def _fit_lines(report: Json) -> list[str]:
             "positions of the lights before anything else"
         )
     lines += [f"dictionary, {line}" for line in report.get("dictionary_notes", [])]
-    lines += [
-        _site_line(site, entry)
-        for site, entry in report.get("translucency", {}).items()
-    ]
+    lines += [_site_line(*site) for site in report.get("translucency", {}).items()]
     lines += [_suspect_line(entry) for entry in report["suspects"]]
     if (energy := report.get("surface_energy", {})).get("contradicted"):
         lines.append(
@@ -216,16 +203,11 @@ def _site_line(site: str, result: Json) -> str:
 
 
 def _suspect_line(suspect: Json) -> str:
-    device, question = (
-        ("light", "did the face move?")
-        if "light" in suspect
-        else ("camera", "was it moved?")
-    )
-    fraction = suspect["outlier_fraction"]
-    misfit = suspect["misfit"]
+    questions = {"light": "did the face move?", "camera": "was it moved?"}
+    device = "light" if "light" in suspect else "camera"
     return (
-        f"{device} {suspect[device]}: {fraction:.0%} of its samples are outliers, residuals "
-        f"{misfit:.1f} times noise ({question})"
+        f"{device} {suspect[device]}: {suspect['outlier_fraction']:.0%} of its samples are "
+        f"outliers, residuals {suspect['misfit']:.1f} times noise ({questions[device]})"
     )
 
 
@@ -242,12 +224,9 @@ def dictionary_command(path: Path | None, disc: float) -> None:
 
     The report has the energy, reciprocity, errors and missing values of each BRDF.
     """
-    dictionary = (
-        skindb.fit.read_dictionary(path) if path else skindb.fit.embedded_dictionary()
-    )
-    report = skindb.fit.dictionary_report(
-        dictionary, disc_angular_radius=math.radians(disc)
-    )
+    fit = skindb.fit
+    dictionary = fit.read_dictionary(path) if path else fit.embedded_dictionary()
+    report = fit.dictionary_report(dictionary, disc_angular_radius=math.radians(disc))
     columns = {str(name): v for name, v in report.items() if v.dims == ("dictionary",)}
     rows = [
         [name, *(float(v[i]) for v in columns.values())]
@@ -259,9 +238,8 @@ def dictionary_command(path: Path | None, disc: float) -> None:
     ]
     header = ["dictionary", *columns]
     figures = report.attrs | {
-        "disc_angular_radius": float(report["disc_angular_radius"])
+        "disc_angular_radius": float(report["disc_angular_radius"]),
+        "header": header,
+        "rows": rows,
     }
-    emit(
-        figures | {"header": header, "rows": rows},
-        [*aligned([header, *rows]), *worst, *report.attrs["notes"]],
-    )
+    emit(figures, [*aligned([header, *rows]), *worst, *report.attrs["notes"]])

@@ -112,18 +112,14 @@ def _rendered(
     skipped = report["skipped"] or ["nothing is skipped"]
     if explain:
         return report["take"], report, [*skipped, *report["kept"]]
-    relative_error = report["relative_error"]
-    path = (
+    line = (
         f"{report['path']}: {report['samples']} rays per pixel, relative standard error "
-        f"{relative_error:.2%}"
+        f"{report['relative_error']:.2%}"
     )
-    missed = (
-        f", above the wanted {error:.2%}"
-        if error is not None and relative_error > error
-        else ""
-    )
-    plan = [f"plan: {line}" for line in skipped]
-    return report["take"], report, [*(plan if asked("verbose") else []), path + missed]
+    if error is not None and report["relative_error"] > error:
+        line += f", above the wanted {error:.2%}"
+    plan = [f"plan: {step}" for step in skipped] if asked("verbose") else []
+    return report["take"], report, [*plan, line]
 
 
 @command
@@ -158,14 +154,8 @@ def compare(
         {name: getattr(c, name) for name in stated} | c.error | {"filled": c.filled}
         for c in comparisons
     ]
-    header = [
-        *stated,
-        "relative_rmse",
-        "psnr",
-        "ssim",
-        "delta_e_median",
-        "fine_contrast",
-    ]
+    measures = ("relative_rmse", "psnr", "ssim", "delta_e_median", "fine_contrast")
+    header = [*stated, *measures]
     rows = [[row[name] for name in header] for row in result]
     emit(result, aligned([header, *rows]))
 
@@ -263,7 +253,7 @@ def _label(text: str) -> tuple[str, str]:
 
 @command
 @DB
-@click.argument("takes", metavar="[TAKE...]", nargs=-1)
+@TAKES
 @click.option(
     "--out",
     type=PATH,

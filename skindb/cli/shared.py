@@ -26,7 +26,6 @@ from skindb.errors import (
     Fault,
     InputError,
     few_names,
-    input_error,
     require,
     require_none,
 )
@@ -54,11 +53,8 @@ def cluster() -> Iterator[Client | None]:
         yield None
         return
     if not asked("verbose"):
-        logging.disable(
-            logging.ERROR
-            # messages of distributed; their consequence for the takes is reported in one
-            # line
-        )
+        # messages of distributed; their consequence for the takes is reported in one line
+        logging.disable(logging.ERROR)
     with workflow.connected(scheduler) as client:
         yield client
 
@@ -176,12 +172,12 @@ def each_take(
                 function, takes, workers=workers, client=client, shared=shared
             ):
                 name, result = _finished(outcome, finish)
-                if outcome.error is None:
-                    results[name] = result
-                else:
+                failed = outcome.error is not None
+                if failed:
                     faults += result
-                has_failed = outcome.error is not None
-                progress.end_take(name, failed=has_failed, following=next(following))
+                else:
+                    results[name] = result
+                progress.end_take(name, failed=failed, following=next(following))
     except InputError as error:  # of the cluster: no other take can be processed
         faults += error.faults
     return results, faults
@@ -220,13 +216,10 @@ def fault_lines(faults: Iterable[Fault], *, unlimited: bool) -> list[str]:
         count[fault.rule] += 1
         if unlimited or count[fault.rule] <= MAX_ALIKE:
             lines.append(str(fault))
-    folded = {
-        rule: n - MAX_ALIKE
+    return lines + [
+        f"and {n - MAX_ALIKE} more: {rule} (-v lists them)"
         for rule, n in count.items()
         if n > MAX_ALIKE and not unlimited
-    }
-    return lines + [
-        f"and {n} more: {rule} (-v lists them)" for rule, n in folded.items()
     ]
 
 
@@ -257,11 +250,9 @@ def chosen_takes(
 ) -> list[str]:
     """The named takes, or all that have a model or an edit."""
     chosen = list(takes) or database.takes(kind)
-    if not chosen:
-        cure = "run skindb edit first" if kind == "edit" else "run skindb fit first"
-        raise input_error(
-            database.url, f"there must be a take with a {kind}", "none", cure
-        )
+    cure = f"run skindb {'edit' if kind == 'edit' else 'fit'} first"
+    rule = f"there must be a take with a {kind}"
+    require(chosen, database.url, rule, "none", cure)
     return chosen
 
 
@@ -278,14 +269,9 @@ def require_one_take(out: Path, takes: Sequence[str]) -> None:
 
 def writable(path: Path, *endings: str) -> None:
     """Check the name and folder of a file before the work of which it is the result."""
+    rule = f"must end in {' or '.join(endings)}"
     ending = path.suffix or "no ending"
-    require(
-        path.suffix.lower() in endings,
-        str(path),
-        f"must end in {' or '.join(endings)}",
-        ending,
-        "rename it",
-    )
+    require(path.suffix.lower() in endings, str(path), rule, ending, "rename it")
     require_folder(path)
 
 
@@ -313,10 +299,10 @@ def calibrated_by_lines(provenance: Attributes) -> list[str]:
     """The calibration that a capture used, and why if the capture does not name it."""
     if not (used := provenance.get("calibrated_by")):
         return []
-    reason = (
-        "" if provenance.get("calibration") else ", made from takes with its lights"
-    )
-    return [f"calibration {used['take']}, version {used['generation']}{reason}"]
+    line = f"calibration {used['take']}, version {used['generation']}"
+    if not provenance.get("calibration"):
+        line += ", made from takes with its lights"
+    return [line]
 
 
 def choice_lines(corrections: Mapping[str, str]) -> list[str]:

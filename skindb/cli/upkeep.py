@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -47,28 +47,18 @@ def info(db: str, where: str | None, release: str | None) -> None:
     database = existing(db)
     of_release = None
     if release is not None:
-        of_release = sorted(
-            {
-                *database.takes(release=release),
-                *database.takes("model", release=release),
-            }
-        )
+        kinds = ("capture", "model")
+        named = (database.takes(kind, release=release) for kind in kinds)
+        of_release = sorted(set().union(*named))
     result = database.info(takes=of_release, where=where, release=release)
     details = asked("verbose")
     # figures of merit and translucency are values of subjects
-    log = (
-        workflow.logged_action(database, "show", result["takes"])
-        if details
-        else nullcontext()
-    )
-    with log:
+    action = workflow.logged_action(database, "show", result["takes"])
+    with action if details else nullcontext():
         lines = _info_lines(database, result, details=details)
-    if (
-        where is None
-        and release is None
-        and (superseded := workflow.superseded_calibrations(database))
-    ):
-        result["superseded_calibrations"] = superseded
+    if where is None and release is None:
+        superseded = workflow.superseded_calibrations(database)
+        result |= {"superseded_calibrations": superseded} if superseded else {}
         lines += workflow.superseded_lines(superseded)
     emit(result, lines or ["The database holds no takes."])
 
@@ -132,34 +122,24 @@ def _version_lines(database: Database, parts: Iterable[tuple[str, Json]]) -> lis
     lines = []
     for name, kinds in parts:
         for kind, version in kinds.items():
-            text = version.get("fault") or "  ".join(
-                [
-                    *_cells(version),
-                    "data/" + version["path"].rpartition("/data/")[2],
-                ]
-            )
+            text = version.get("fault")
+            if text is None:
+                path = "data/" + version["path"].rpartition("/data/")[2]
+                text = "  ".join([*_cells(version), path])
             if version.get("stale"):
                 text += f"  out of date: {version['stale'][0]}"
             lines.append(f"{name}  {kind}  {text}")
             lines += indented(calibrated_by_lines(version))
             if kind in DETAILS and "fault" not in version:
-                lines += indented(_details(database, kind, name))
+                try:
+                    lines += indented(DETAILS[kind](database, name))
+                except InputError as error:  # the version is damaged
+                    lines += indented(map(str, error.faults))
     return lines
 
 
-def _details(database: Database, kind: str, take: str) -> list[str]:
-    """Lines that info -v adds; the faults of a damaged version are listed in their place."""
-    try:
-        return DETAILS[kind](database, take)
-    except InputError as error:
-        return [str(fault) for fault in error.faults]
-
-
-def _sample_lines(database: Database, take: str) -> list[str]:
+def _sample_lines(samples: Any, take: str) -> list[str]:
     """Table of samples by region; nothing for captures without a dome or without this table."""
-    samples = (
-        database.record("capture", take).provenance.get("summary", {}).get("samples")
-    )
     if samples is None:
         return []
     try:
@@ -182,9 +162,7 @@ def _prediction_lines(database: Database, take: str) -> list[str]:
     fit = skindb.fit
     table = database.tables(record)
     if not table:  # committed by a program of its own, without tables
-        table = fit.prediction_table(
-            database.read("model", take)["fitted"].to_dataset()
-        )
+        table = fit.prediction_table(database.read("model", take)["fitted"].dataset)
     lines = [
         *aligned(fit.tabulate_prediction(fit.describe_prediction(table))),
         *aligned(fit.tabulate_diffuse(table)),
@@ -196,7 +174,7 @@ def _prediction_lines(database: Database, take: str) -> list[str]:
 def _capture_lines(database: Database, take: str) -> list[str]:
     summary = database.record("capture", take).provenance.get("summary", {})
     return [
-        *_sample_lines(database, take),
+        *_sample_lines(summary.get("samples"), take),
         *calibration_lines(database, take),
         *choice_lines(summary.get("corrections", {})),
     ]
@@ -286,16 +264,13 @@ def clean(db: str, generations: int | None, yes: bool) -> None:
         + (f"  (kept: {item.kept})" if item.kept else "")
         for item in [*going, *remaining]
     ]
-    lines.append(
-        f"{len(going)} removed, {total / 1e6:.1f} MB"
-        if yes
-        else f"{len(going)} to remove, {total / 1e6:.1f} MB"
-        + ("; --yes removes them" if going else "")
+    total_line = (
+        f"{len(going)} {'removed' if yes else 'to remove'}, {total / 1e6:.1f} MB"
     )
-    emit(
-        {"removed": yes, "bytes": total, "items": [asdict(item) for item in garbage]},
-        lines,
-    )
+    if going and not yes:
+        total_line += "; --yes removes them"
+    items = [asdict(item) for item in garbage]
+    emit({"removed": yes, "bytes": total, "items": items}, [*lines, total_line])
 
 
 @command
@@ -390,32 +365,19 @@ def restore(
 
 
 def _restored_lines(restored: Restored, without_markers: bool) -> list[str]:
-    lines = [
+    lines = {
         f"state {restored.number} of {restored.created}: {restored.versions} versions, "
-        f"{restored.bytes / 1e6:.1f} MB"
-    ]
-    if without_markers:
-        lines.append(
-            "subjects who were withdrawn after this state are in the database "
-            "again: withdraw them again"
-        )
-    if restored.skipped:
-        lines.append(
-            f"not restored, because of withdrawals: {restored.skipped} versions"
-        )
-    if restored.requests:
-        lines.append(
-            f"results to be computed again by skindb refresh: {restored.requests}"
-        )
-    if restored.consents:
-        lines.append(f"later records of consent, repeated: {restored.consents}")
-    if restored.unknown_consents:
-        lines.append(
-            "later records of consent of subjects who are not in this state: "
-            f"{restored.unknown_consents}; "
-            "record them again when their captures are ingested"
-        )
-    return lines
+        f"{restored.bytes / 1e6:.1f} MB": True,
+        "subjects who were withdrawn after this state are in the database again: "
+        "withdraw them again": without_markers,
+        f"not restored, because of withdrawals: {restored.skipped} versions": restored.skipped,
+        f"results to be computed again by skindb refresh: {restored.requests}": restored.requests,
+        f"later records of consent, repeated: {restored.consents}": restored.consents,
+        "later records of consent of subjects who are not in this state: "
+        f"{restored.unknown_consents}; record them again when their captures are "
+        "ingested": restored.unknown_consents,
+    }
+    return [line for line, is_shown in lines.items() if is_shown]
 
 
 def _as_json(report: BackupReport | Restored) -> Json:

@@ -316,13 +316,13 @@ class Link:
             self._write(line)
             if (reply := self._wait()) is not None:
                 return self._require_ok(verb, reply)
-        found = "no reply"
+        finding = "no reply"
         if self.damaged:
             found += (
                 f", and {self.damaged} damaged lines, the last {self._lines.sample!r}"
             )
         rule = f"must answer {verb} within {ATTEMPTS * REPLY_SECONDS:.1f} s"
-        raise NoReplyError(Fault(self.name, rule, found, CURE))
+        raise NoReplyError(Fault(self.name, rule, finding, CURE))
 
     def value(self, message: Message, name: str, accepted: Accepted[T]) -> T:
         """A value of a reply or an event.
@@ -357,12 +357,12 @@ class Link:
             except NoReplyError:
                 if self.clock.monotonic() >= deadline:
                     raise
-        found = reply.values.get("kind", "an unknown device")
-        found += f" with protocol {reply.values.get('protocol', '?')}"
+        finding = reply.values.get("kind", "an unknown device")
+        finding += f" with protocol {reply.values.get('protocol', '?')}"
         expected = f"{kind} with protocol {PROTOCOL}"
-        if found != expected:
+        if finding != expected:
             cure = "check which device has which address"
-            raise self.error(f"must be a {expected}", found, cure)
+            raise self.error(f"must be a {expected}", finding, cure)
         return reply
 
     def events(self) -> list[Message]:

@@ -94,10 +94,9 @@ class Spool:
         meta = np.empty((0, lights, cameras, 3), np.float16)
         chunks = (sizes, (lights,), (cameras,), (3,))
         name = f"spool-{uuid.uuid4().hex}"
-        lazy = da.map_blocks(  # type: ignore[no-untyped-call]
+        return da.map_blocks(  # type: ignore[no-untyped-call]
             shard, chunks=chunks, dtype=np.float16, meta=meta, name=name
         )
-        return lazy
 
     def _write(self, light: int, camera: int, samples: Values16) -> None:
         content = np.ascontiguousarray(samples).data.cast("B")

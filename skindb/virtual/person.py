@@ -187,5 +187,4 @@ def _tables() -> Json:
     """Subjects of the demo, the paper's table 1 (subject of dataset A, groups of dataset
     B), and the terms of a linear model of the shape of faces.
     """
-    tables = package_json("skindb.virtual", "person.json")
-    return tables
+    return package_json("skindb.virtual", "person.json")
