@@ -318,7 +318,7 @@ class Link:
                 return self._require_ok(verb, reply)
         finding = "no reply"
         if self.damaged:
-            found += (
+            finding += (
                 f", and {self.damaged} damaged lines, the last {self._lines.sample!r}"
             )
         rule = f"must answer {verb} within {ATTEMPTS * REPLY_SECONDS:.1f} s"
