@@ -103,10 +103,8 @@ def read_boards(folder: Path) -> Boards:
         fields.fault("frames", f"must have pictures of {camera}", "none")
     require_none(faults)
     middle = squares * square / 2
-    found = float64(board.getChessboardCorners())
-    corners = np.stack(
-        [found[:, 0] - middle[0], middle[1] - found[:, 1], 0 * found[:, 2]], axis=1
-    )
+    corners = float64(board.getChessboardCorners())
+    corners = (corners - [*middle, 0]) * [1, -1, 0]
     return Boards(corners, views, sizes)
 
 
@@ -194,13 +192,12 @@ def calibrate_cameras(boards: Boards) -> dict[str, CalibratedCamera]:
     def differences(x: Float64) -> Float64:
         projected = []
         for name in sorted(names):
-            points = [
-                _moved(x[places[pose]], boards.corners[boards.views[camera, pose][0]])
-                if pose in places
-                else boards.corners[boards.views[camera, pose][0]]
-                for camera, pose in views
-                if camera == name
-            ]
+            points = []
+            for view in views:
+                if view[0] == name:
+                    seen = boards.corners[boards.views[view][0]]
+                    place = places.get(view[1])
+                    points.append(seen if place is None else _moved(x[place], seen))
             one = _pinhole(x[parts[name]])
             projected.append(one.project(np.concatenate(points)).ravel())
         apart = np.concatenate(projected) - pixels
@@ -227,20 +224,10 @@ def calibrate_cameras(boards: Boards) -> dict[str, CalibratedCamera]:
         return matrix
 
     fit = least_squares(differences, x, slopes, method="lm", x_scale="jac")
-    rms = {
-        name: float(
-            np.sqrt(
-                np.mean(
-                    np.concatenate(
-                        [fit.fun[row] for view, row in rows.items() if view[0] == name]
-                    )
-                    ** 2
-                )
-                * 2
-            )
-        )
-        for name in names
-    }
+    rms = {}
+    for name in names:
+        parts_of = [fit.fun[row] for view, row in rows.items() if view[0] == name]
+        rms[name] = float(np.sqrt(2 * np.mean(np.concatenate(parts_of) ** 2)))
     require_none(
         [
             Fault(
@@ -288,10 +275,8 @@ def _start(
         single[camera] = np.array(
             [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *np.ravel(bent)[:5]]
         )
-        for pose, turn, shift in zip(poses, turns, shifts, strict=True):
-            seen[camera, pose] = _matrix(
-                np.concatenate([np.ravel(turn), np.ravel(shift)])
-            )
+        for pose, *vectors in zip(poses, turns, shifts, strict=True):
+            seen[camera, pose] = _matrix(np.ravel(vectors))
     poses_at = {1: np.eye(4)}  # from the board to the frame of the first pose
     cameras_at = {}  # from that frame to the camera
     order = sorted(seen, key=lambda view: -len(boards.views[view][0]))
@@ -310,8 +295,8 @@ def _start(
         "take pictures that two cameras see at once",
     )
     cameras = {
-        name: np.concatenate([single[name], _vector(cameras_at[name])])
-        for name in single
+        name: np.concatenate([lens, _vector(cameras_at[name])])
+        for name, lens in single.items()
     }
     return cameras, {pose: _vector(matrix) for pose, matrix in sorted(poses_at.items())}
 

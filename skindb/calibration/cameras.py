@@ -187,22 +187,17 @@ def calibrate_cameras(dome: DomeRecord, frames: CalibrationFrames) -> xr.Dataset
         for name, kind in frames.kinds.items():
             if camera.id not in kind.places:
                 continue
-            step = attempt(
-                faults,
-                partial(STEPS[name], frames, kind, improved),
-                where=f"{name} frames of camera {camera.id}: {{}}",
-            )
+            place = f"{name} frames of camera {camera.id}: {{}}"
+            call = partial(STEPS[name], frames, kind, improved)
+            step = attempt(faults, call, where=place)
             if step is None:
                 break
             improved = step[0]
             values |= step[1]
         if camera.id in frames.points:
             place = f"{frames.folder / FILE}[points], camera {camera.id}"
-            points = frames.points[camera.id]
-            values |= (
-                attempt(faults, lambda: _reprojection(points, camera), where=place)
-                or {}
-            )
+            check = partial(_reprojection, frames.points[camera.id], camera)
+            values |= attempt(faults, check, where=place) or {}
         return values
 
     with ThreadPoolExecutor(THREADS) as pool:
@@ -302,13 +297,12 @@ def _flat(
     # in linear values above black; saturated values stay at the white level, so that
     # the fit excludes them
     pairs = [
-        [
-            relative_exposure(frame, None, sensor)[0][..., GREEN] * span
-            for frame in repeats[:2]
-        ]
+        [relative_exposure(frame, None, sensor)[0][..., GREEN] for frame in repeats[:2]]
         for repeats in sets
     ]
-    noise = fit_noise(np.array(pairs), black=0.0, white=float(span), step=sensor.step)
+    noise = fit_noise(
+        span * np.array(pairs), black=0.0, white=float(span), step=sensor.step
+    )
     sensor = replace(
         sensor, electrons_per_dn=noise.electrons_per_dn, read_noise=noise.read_noise
     )

@@ -64,7 +64,8 @@ def placement_signal(
         _fibre_means(radiance[0, columns], error[0, columns])
         for columns in (np.searchsorted(union, pixels) for pixels in fibres)
     ]
-    return np.array([mean for mean, _ in means]), np.array([e for _, e in means])
+    value, deviation = map(np.array, zip(*means, strict=True))
+    return value, deviation
 
 
 def _fibre_means(radiance: Image, error: Image) -> tuple[Float64, Float64]:
@@ -98,11 +99,9 @@ def fibre_pixels(probe: ProbeRecord, shape: tuple[int, ...]) -> list[Index]:
     fibres = []
     total = 0
     for centre, radius in zip(probe.centre, probe.radius, strict=True):
-        (left, right), (top, bottom) = (
-            (
-                min(max(math.floor(c - radius), 0), side),
-                min(math.ceil(c + radius), side),
-            )
+        left, top = (max(math.floor(c - radius), 0) for c in centre)
+        right, bottom = (
+            min(math.ceil(c + radius), side)
             for c, side in zip(centre, shape[::-1], strict=True)
         )
         total += max(right - left, 0) * max(bottom - top, 0)
@@ -119,19 +118,12 @@ def fibre_pixels(probe: ProbeRecord, shape: tuple[int, ...]) -> list[Index]:
             (x - centre[0]) ** 2 + (y - centre[1]) ** 2 <= radius * radius
         )
         fibres.append((row + top) * shape[1] + column + left)
+    rule = "a fibre must lie in the picture"
     finding = f"no pixel of {shape[1]} x {shape[0]}"
     cure = "correct its centre and radius, in pixels"
-    faults = [
-        Fault(
-            f"{probe.file}[fibres][{i}]",
-            "a fibre must lie in the picture",
-            finding,
-            cure,
-        )
-        for i, pixels in enumerate(fibres)
-        if not len(pixels)
-    ]
-    require_none(faults)
+    outside = [i for i, pixels in enumerate(fibres) if not len(pixels)]
+    place = f"{probe.file}[fibres]"
+    require_none([Fault(f"{place}[{i}]", rule, finding, cure) for i in outside])
     return fibres
 
 

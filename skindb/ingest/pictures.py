@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -308,23 +309,14 @@ class _Frames:
         if picture is None:
             return
         height, width, _ = picture.shape
-        wanted = (
-            camera.setdefault("width", width),
-            camera.setdefault("height", height),
-        )
-        exact = picture.dtype == self.dtype or (
-            self.linear and picture.dtype.kind == "f"
-        )
-        if wanted != (width, height) or not exact:
-            rule = "all pictures must be {} x {} of {}".format(*wanted, self.dtype)
-            self.faults.append(
-                Fault(
-                    str(file),
-                    rule,
-                    f"{width} x {height} of {picture.dtype}",
-                    "export it like the others",
-                )
-            )
+        wanted = f"{camera.setdefault('width', width)} x {camera.setdefault('height', height)}"
+        size = f"{width} x {height}"
+        is_linear = self.linear and picture.dtype.kind == "f"
+        if size != wanted or not (picture.dtype == self.dtype or is_linear):
+            rule = f"all pictures must be {wanted} of {self.dtype}"
+            finding = f"{size} of {picture.dtype}"
+            cure = "export it like the others"
+            self.faults.append(Fault(str(file), rule, finding, cure))
             return
         if inside is not None:
             picture[~inside] = 0
@@ -337,14 +329,10 @@ class _Frames:
             if np.ptp(picture) > 0:
                 same = self.files_by_content.setdefault(hash(picture.tobytes()), file)
                 if same != file:
-                    self.faults.append(
-                        Fault(
-                            str(file),
-                            "every picture must have been taken by itself",
-                            f"a copy of {same.name}",
-                            "copy the right picture from the camera again",
-                        )
-                    )
+                    rule = "every picture must have been taken by itself"
+                    cure = "copy the right picture from the camera again"
+                    finding = f"a copy of {same.name}"
+                    self.faults.append(Fault(str(file), rule, finding, cure))
         target = self.out / f"dome/frames/{light}_{camera['id']}{self.suffix}"
         make_private(target.parent)
         write_frame(target, picture)
@@ -364,7 +352,8 @@ class _Frames:
     ) -> None:
         """Write the other files, capture.json last."""
         require_none(self.faults)
-        low, high = (f(self.exposures, default=0.0) for f in (min, max))
+        low = min(self.exposures, default=0.0)
+        high = max(self.exposures, default=0.0)
         same = high <= EXPOSURE_RATIO * low
         require(
             same or len({light.gain for light in lights}) > 1,
@@ -526,9 +515,11 @@ def _require_directions(place: Path, table: Sequence[Light]) -> list[str]:
         for light, w in zip(table, way, strict=True)
     ]
     same = [x.name for x, at in zip(table, places, strict=True) if places.count(at) > 1]
-    return [f"lights behind the subject, z not above 0: {few_names(behind)}"] * any(
-        behind
-    ) + [f"pictures under a light in the same place: {few_names(same)}"] * any(same)
+    notes = (
+        ("lights behind the subject, z not above 0", behind),
+        ("pictures under a light in the same place", same),
+    )
+    return [f"{text}: {few_names(names)}" for text, names in notes if names]
 
 
 def _typical(files: Sequence[Path]) -> Path:
@@ -662,34 +653,30 @@ def _olat_files(
         for file in [*source.glob("*"), *source.glob("*/*")]
         if file.suffix.lower() in SUFFIXES
     }
-    best: tuple[int, str, dict[tuple[str, str], Path]] = (-1, "", {})
-    for pattern in PATTERNS:
+    views = list(product(lights, cameras))
+
+    def files_of(pattern: str) -> dict[tuple[str, str], Path]:
         files = {}
-        for light in lights:
+        for light, camera in views:
             suffix = Path(light).suffix
             is_file = suffix.lower() in SUFFIXES
             name = light.removesuffix(suffix) if is_file else light
-            for camera in cameras:
-                stem = _folded(pattern.format(light=name, camera=camera))
-                if file := by_name.get(stem):
-                    files[light, camera] = file
-        if len(files) > best[0]:
-            best = (len(files), pattern, files)
-    count, pattern, files = best
-    missing = [(x, c) for x in lights for c in cameras if (x, c) not in files]
-    require(
-        not missing,
-        str(source),
-        "every light and camera must have a picture: CAMERA/LIGHT, LIGHT/CAMERA, "
-        "CAMERA_LIGHT or LIGHT_CAMERA",
-        f"{count} of {len(lights) * len(cameras)}"
-        + (
-            f", none of light {missing[0][0]}, camera {missing[0][1]}"
-            if missing
-            else ""
-        ),
-        "check the names in the tables of lights and cameras",
-    )
+            stem = _folded(pattern.format(light=name, camera=camera))
+            if file := by_name.get(stem):
+                files[light, camera] = file
+        return files
+
+    candidates = {pattern: files_of(pattern) for pattern in PATTERNS}
+    pattern, files = max(candidates.items(), key=lambda one: len(one[1]))
+    for light, camera in views:
+        require(
+            (light, camera) in files,
+            str(source),
+            "every light and camera must have a picture: CAMERA/LIGHT, LIGHT/CAMERA, "
+            "CAMERA_LIGHT or LIGHT_CAMERA",
+            f"{len(files)} of {len(views)}, none of light {light}, camera {camera}",
+            "check the names in the tables of lights and cameras",
+        )
     return pattern, files
 
 

@@ -14,16 +14,14 @@ from skindb.limits import MAX_CAMERAS, MAX_SCAN_BYTES
 
 def read_cameras(source: Path, given: Path | None) -> list[Json]:
     """Cameras of a JSON file, or of the text files of COLMAP."""
-    path = given or (
-        source / "cameras.json" if (source / "cameras.json").exists() else source
-    )
+    listed = source / "cameras.json"
+    path = given or (listed if listed.exists() else source)
     if path.is_dir():
         return _colmap_cameras(path)
     faults = list[Fault]()
     data = read_json(path, faults)
-    fields = Fields(
-        {"cameras": data} if isinstance(data, list) else data, str(path), faults
-    )
+    data = {"cameras": data} if isinstance(data, list) else data
+    fields = Fields(data, str(path), faults)
     items = [] if faults else fields.items("cameras", maximum=MAX_CAMERAS)
     for item in items:
         item.text("id")
