@@ -94,11 +94,17 @@ def stream(device: str, folder: Path, features: str) -> None:
     pixel_format = camera.get_pixel_format_as_string()
     tiff_head(1, 1, pixel_format)
     frames = camera.create_stream(None, None)
+    if camera.is_gv_device():
+        # otherwise bursts of packets are lost unless raw sockets are allowed
+        frames.set_property("socket-buffer", Aravis.GvStreamSocketBuffer.FIXED)
+        frames.set_property("socket-buffer-size", BUFFER_BYTES)
     payload = camera.get_payload()
-    for _ in range(min(max(BUFFER_BYTES // payload, 8), 500)):
-        frames.push_buffer(Aravis.Buffer.new_allocate(payload))
     begin = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
     camera.start_acquisition()
+    # if they are, packets of other devices are counted until the socket has its filter
+    before = _statistics(frames)
+    for _ in range(min(max(BUFFER_BYTES // payload, 8), 500)):
+        frames.push_buffer(Aravis.Buffer.new_allocate(payload))
     say("armed")
     counts = {"frames": 0, "incomplete": 0}
     number = None
@@ -128,7 +134,9 @@ def stream(device: str, folder: Path, features: str) -> None:
                 if line == b"trigger":
                     camera.software_trigger()
                 else:
-                    say(json.dumps(counts | _statistics(frames)))
+                    after = _statistics(frames)
+                    lost = {key: n - before[key] for key, n in after.items()}
+                    say(json.dumps(counts | lost))
 
 
 def _statistics(frames: Any) -> dict[str, int]:

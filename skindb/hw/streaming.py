@@ -102,8 +102,8 @@ class StreamingCameras(FolderCameras):
                     f"{key.replace('_', ' ')} {n}" for key, n in lost.items()
                 )
                 warnings.warn(
-                    f"camera {name} lost frames ({text}): allow jumbo frames, or lower "
-                    "its rate",
+                    f"camera {name} lost frames ({text}): raise net.core.rmem_max, allow "
+                    "jumbo frames, or lower its rate",
                     SkindbWarning,
                     stacklevel=2,
                 )
