@@ -166,68 +166,69 @@ def calibrate_cameras(boards: Boards) -> dict[str, CalibratedCamera]:
         ]
     )
     cameras, poses = _start(boards, poses_of)
-    names, numbers = list(cameras), [pose for pose in poses if pose != 1]
-    x = np.concatenate([*cameras.values(), *(poses[pose] for pose in numbers)])
-    parts = {
-        name: slice(OF_CAMERA * i, OF_CAMERA * (i + 1)) for i, name in enumerate(names)
-    }
-    first = OF_CAMERA * len(names)
-    places = {
-        n: slice(first + OF_POSE * i, first + OF_POSE * (i + 1))
-        for i, n in enumerate(numbers)
-    }
-    # rows of a camera follow each other, so that it projects all of its points at once
+    # rows of a camera follow each other; the first pose is the frame, and has no numbers
+    names, numbers = sorted(cameras), list(poses)
     views = sorted(boards.views)
-    ends = np.cumsum([2 * len(boards.views[view][0]) for view in views])
-    rows = dict(zip(views, map(slice, [0, *ends[:-1]], ends), strict=True))
-    pixels = np.concatenate([boards.views[view][1] for view in views]).ravel()
-    # k2 and k3 of each camera, and how far they may bend its picture before they cost as
-    # much as corners: otherwise noise bends a corner that no board has reached
-    bent = np.array([[parts[name].start + i for i in (5, 8)] for name in names])
+    points = [len(boards.views[view][0]) for view in views]
+    of_camera = np.repeat([names.index(name) for name, _ in views], points)
+    of_pose = np.repeat([numbers.index(pose) for _, pose in views], points)
+    indices, seen = zip(*(boards.views[view] for view in views), strict=True)
+    corners = boards.corners[np.concatenate(indices)]
+    pixels = np.concatenate(seen)
+    x = np.concatenate([*map(cameras.get, names), *[*poses.values()][1:]])
+    first = OF_CAMERA * len(names)
+    # how far k2 and k3 of each camera may bend its picture before they cost as much as
+    # corners: otherwise noise bends a corner that no board has reached
     reach = np.array(
         [np.hypot(*boards.sizes[name]) / 2 / cameras[name][0] for name in names]
     )
     bends = CORNER_PX / MAX_BEND * np.stack([reach**4, reach**6], axis=1)
+    of_bend = np.arange(bends.size)
+    # of each difference; -1 for the frame and for bends, which depend on no pose
+    owners = (
+        np.concatenate([np.repeat(of_camera, 2), of_bend // 2]),
+        np.concatenate([np.repeat(of_pose, 2) - 1, np.full(bends.size, -1)]),
+    )
 
     def differences(x: Float64) -> Float64:
-        projected = []
-        for name in sorted(names):
-            points = []
-            for view in views:
-                if view[0] == name:
-                    seen = boards.corners[boards.views[view][0]]
-                    place = places.get(view[1])
-                    points.append(seen if place is None else _moved(x[place], seen))
-            one = _pinhole(x[parts[name]])
-            projected.append(one.project(np.concatenate(points)).ravel())
+        lenses = x[:first].reshape(-1, OF_CAMERA)
+        turn, shift = np.split(
+            np.pad(x[first:], (OF_POSE, 0)).reshape(-1, OF_POSE)[of_pose], 2, axis=1
+        )
+        places = Rotation.from_rotvec(turn).apply(corners) + shift
+        projected = [
+            _pinhole(lens).project(places[of_camera == i])
+            for i, lens in enumerate(lenses)
+        ]
         apart = np.concatenate(projected) - pixels
         apart = np.where(np.isfinite(apart), apart, FAR_PX)
-        return float64(np.concatenate([apart, (bends * x[bent]).ravel()]))
+        return np.concatenate([apart.ravel(), (bends * lenses[:, [5, 8]]).ravel()])
 
     def slopes(x: Float64) -> Float64:
         """Finite differences; a row depends on one camera and one pose, so that numbers of
         different cameras, or poses, are changed at once.
         """
-        matrix = np.zeros((len(pixels) + bent.size, len(x)))
-        matrix[len(pixels) + np.arange(bent.size), bent.ravel()] = bends.ravel()
         here = differences(x)
-        for count, begin, end in ((OF_CAMERA, 0, first), (OF_POSE, first, len(x))):
+        matrix = np.zeros((len(here), len(x)))
+        step = STEP * np.maximum(np.abs(x), 1.0)
+        parts = ((0, first, OF_CAMERA), (first, len(x), OF_POSE))
+        for owner, (begin, end, count) in zip(owners, parts, strict=True):
+            rows = np.flatnonzero(owner >= 0)
             for i in range(begin, begin + count):
-                step = np.zeros(len(x))
-                step[i:end:count] = STEP * np.maximum(np.abs(x[i:end:count]), 1.0)
-                change = differences(x + step) - here
-                for (camera, pose), row in rows.items():
-                    part = parts[camera] if begin == 0 else places.get(pose)
-                    if part is not None:
-                        column = part.start + i - begin
-                        matrix[row, column] = change[row] / step[column]
+                changed = np.zeros(len(x))
+                changed[i:end:count] = step[i:end:count]
+                change = differences(x + changed) - here
+                columns = i + count * owner[rows]
+                matrix[rows, columns] = change[rows] / step[columns]
         return matrix
 
     fit = least_squares(differences, x, slopes, method="lm", x_scale="jac")
-    rms = {}
-    for name in names:
-        parts_of = [fit.fun[row] for view, row in rows.items() if view[0] == name]
-        rms[name] = float(np.sqrt(2 * np.mean(np.concatenate(parts_of) ** 2)))
+    apart = fit.fun[: pixels.size]
+    square = (apart**2).reshape(-1, 2).sum(axis=1)
+    rms = {
+        name: float(np.sqrt(square[of_camera == i].mean()))
+        for i, name in enumerate(names)
+    }
     require_none(
         [
             Fault(
@@ -240,17 +241,20 @@ def calibrate_cameras(boards: Boards) -> dict[str, CalibratedCamera]:
             if not value <= MAX_REPROJECTION_PX
         ]
     )
-    apart = fit.fun[: len(pixels)]
-    variance = float(apart @ apart) / (len(apart) - len(x))
+    variance = float(square.sum()) / (len(apart) - len(x))
     error = np.sqrt(variance * np.diagonal(np.linalg.inv(fit.jac.T @ fit.jac)))
+    lenses, errors = (
+        dict(zip(names, values[:first].reshape(-1, OF_CAMERA), strict=True))
+        for values in (fit.x, error)
+    )
     return {
         name: CalibratedCamera(
-            **vars(_pinhole(fit.x[parts[name]])),
-            errors=error[parts[name]],
+            **vars(_pinhole(lenses[name])),
+            errors=errors[name],
             rms=rms[name],
             poses=len(poses_of[name]),
         )
-        for name in names
+        for name in cameras
     }
 
 
@@ -311,10 +315,6 @@ def _matrix(vector: Array) -> Float64:
 def _vector(matrix: Array) -> Float64:
     turn = Rotation.from_matrix(matrix[:3, :3]).as_rotvec()
     return np.concatenate([turn, matrix[:3, 3]])
-
-
-def _moved(vector: Array, points: Array) -> Float64:
-    return float64(Rotation.from_rotvec(vector[:3]).apply(points) + vector[3:])
 
 
 def _pinhole(numbers: Array) -> Pinhole:

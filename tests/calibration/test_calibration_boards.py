@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from skindb.calibration.boards import (
     Boards,
-    _moved,
     _pinhole,
     calibrate_cameras,
     read_boards,
@@ -41,6 +40,10 @@ def camera(angle, focal=1800.0, centre=(640.0, 500.0), distance=900.0, bent=-0.1
 TRUTH = {f"c{i}": camera(angle) for i, angle in enumerate(ANGLES)}
 
 
+def placed(vector, points):
+    return Rotation.from_rotvec(vector[:3]).apply(points) + vector[3:]
+
+
 def board_poses(rng):
     poses = {1: np.zeros(6)}
     for pose in range(2, POSES + 1):
@@ -55,7 +58,7 @@ def planted(seed):
     views = {}
     for pose, vector in board_poses(rng).items():
         for name, numbers in TRUTH.items():
-            pixels = _pinhole(numbers).project(_moved(vector, corners))
+            pixels = _pinhole(numbers).project(placed(vector, corners))
             seen = np.flatnonzero(((pixels > 0) & (pixels < SIZE)).all(axis=1))
             noise = rng.normal(0, NOISE_PX, (len(seen), 2))
             views[name, pose] = (seen, pixels[seen] + noise)
@@ -158,7 +161,7 @@ def _draw(folder):
                 ]
             )
             points = np.column_stack([place, np.zeros(4)])
-            pixels = _pinhole(numbers).project(_moved(vector, points))
+            pixels = _pinhole(numbers).project(placed(vector, points))
             # warpPerspective has the centres of pixels at integers
             matrix = cv2.getPerspectiveTransform(
                 np.float32(corner - 0.5), np.float32(pixels - 0.5)
