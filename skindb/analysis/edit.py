@@ -105,7 +105,7 @@ def apply_traits(
     needed = [v.name for v in GROUPS["traits"] if v.name != TEXTURE_SHIFT]
     check(traits, needed, where="traits (run skindb analyze DB traits again)")
     amount = _trait_amounts(amounts, traits)
-    fitted = model["fitted"].to_dataset().load()
+    fitted = model["fitted"].dataset.load()
     tree = model.copy()
     reports = {}
     shift = amount @ traits[variables.TRAIT_BRDF_SHIFT].values
@@ -236,7 +236,7 @@ def move_along_modes(
     uv
         (surfel, 2) common (u, v) of the surfels, from `register`.
     """
-    fitted = model["fitted"].to_dataset().load()
+    fitted = model["fitted"].dataset.load()
     steps = float64(scores)
     modes = np.tensordot(steps, faces[variables.FACE_MODE].values[: len(steps)], 1)
     maps = np.concatenate([faces[variables.FACE_MEAN].values, modes])
@@ -252,7 +252,7 @@ def move_along_modes(
         place - place.mean(axis=0), mean[:, shape] - mean[:, shape].mean(axis=0)
     )
     moved = place + turn.apply(step[:, shape])
-    triangle = model["mesh"].to_dataset()[variables.TRIANGLE].values
+    triangle = model["mesh"].dataset[variables.TRIANGLE].values
     tilt = vertex_normals(moved, triangle) - vertex_normals(place, triangle)
     normal = fitted[variables.SHADING_NORMAL].values + np.nan_to_num(tilt)
     values = {variables.SURFEL_POSITION: moved, variables.SHADING_NORMAL: unit(normal)}
@@ -291,7 +291,7 @@ def with_basis(
     tables
         (nh, nd, np, m) tables of the dictionary the model was fitted with [sr^-1].
     """
-    fitted = model["fitted"].to_dataset().load()
+    fitted = model["fitted"].dataset.load()
     tree = model.copy()
     weights = _projected(fitted, float64(mixture), brdf_metric(tables))
     tree["basis"] = DataTree(_common_basis(model, mixture, names, tables))
@@ -442,7 +442,7 @@ def _with_moved_sites(tree: DataTree, amount: Array, traits: Dataset) -> DataTre
     """
     tree = tree.drop_nodes([name for name in (PROBED,) if name in tree.children])
     if "translucency" in tree.children:
-        sites = tree["translucency"].to_dataset().load()
+        sites = tree["translucency"].dataset.load()
         log, _ = _log_shift(amount, traits)
         scaled = sites[variables.SITE_SIGMA_TR].values.astype(float) * np.exp(log)
         moved = label(variables.SITE_SIGMA_TR, np.clip(scaled, *SIGMA_TR_RANGE))

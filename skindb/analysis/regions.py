@@ -122,7 +122,7 @@ def take_masks(model: DataTree, registered: Dataset | None = None) -> dict[str, 
     """Masks (n,) of the regions of a take; those of its capture replace those defined
     by the landmarks.
     """
-    return landmark_masks(registered) | own_masks(model["fitted"].to_dataset())
+    return landmark_masks(registered) | own_masks(model["fitted"].dataset)
 
 
 @cache

@@ -413,7 +413,7 @@ def surface_of(
     model: DataTree,
 ) -> tuple[Float64, Float64, Index]:
     """Positions (n, 3) in mm, texture coordinates (n, 2) and triangles (f, 3) of a take."""
-    fitted = model["fitted"].to_dataset()
+    fitted = model["fitted"].dataset
     faces = model["mesh"].dataset[variables.TRIANGLE].values
     position, uv = (
         fitted[name].values.astype(float)

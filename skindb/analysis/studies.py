@@ -85,4 +85,4 @@ def write_plot(ax: Axes | Figure, path: Path) -> None:
 
 def _shown(results: DataTree) -> list[Dataset]:
     names = study_of(results).shown
-    return [results[name].to_dataset().load() for name in names]
+    return [results[name].dataset.load() for name in names]

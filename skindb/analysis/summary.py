@@ -72,7 +72,7 @@ def sample_surfels(
     InputError
         If no surfel was fitted.
     """
-    fitted = model["fitted"].to_dataset()
+    fitted = model["fitted"].dataset
     good = np.flatnonzero(fitted[variables.FIT_STATUS].values == FitStatus.FITTED)
     if not good.size:
         raise no_surfels_error(model)
@@ -104,15 +104,15 @@ def summary_tables(model: DataTree) -> Dataset:
         reflectance with their errors. For every site: sigma_tr with its errors and
         status. Mean weights of the dictionary, and the radius of the lights' discs.
     """
-    fitted = model["fitted"].to_dataset().load()
-    basis = model["basis"].to_dataset()
+    fitted = model["fitted"].dataset.load()
+    basis = model["basis"].dataset
     masks = {FACE: np.ones(fitted.sizes["surfel"], bool)} | own_masks(fitted)
     parts = [
         region_tables(fitted, masks),
         basis[[name for name in IN_TABLES if name in basis]].load(),
     ]
     if "translucency" in model.children:
-        sites = model["translucency"].to_dataset()
+        sites = model["translucency"].dataset
         parts.append(
             sites[[name for name in names_of(Use.SAMPLED) if name in sites]].load()
         )
@@ -401,8 +401,8 @@ def _samples_of(capture: DataTree, index: Index) -> Dataset:
     cameras of the dome.
     """
     places = [variables.LIGHT_POSITION, variables.CAMERA_POSITION]
-    dome = capture["dome"].to_dataset()[places]
-    samples = capture["samples"].to_dataset()[[variables.REFLECTANCE_SAMPLE]]
+    dome = capture["dome"].dataset[places]
+    samples = capture["samples"].dataset[[variables.REFLECTANCE_SAMPLE]]
     chosen = samples.isel(surfel=index)
     return xr.merge([chosen.load(), dome.load()], combine_attrs="override")
 
@@ -436,8 +436,8 @@ def common_maps(
         is trusted, and why not) and `texel_coverage`. Inside the face, values that were
         not measured are interpolated from the surrounding texels; outside they are NaN.
     """
-    fitted = model["fitted"].to_dataset()
-    triangles = model["mesh"].to_dataset()[variables.TRIANGLE].values
+    fitted = model["fitted"].dataset
+    triangles = model["mesh"].dataset[variables.TRIANGLE].values
     uv = registered[variables.COMMON_UV].values
     codes = surfel_texels(fitted)
     raster = rasterise_atlas(uv, triangles, size)

@@ -319,7 +319,7 @@ def calibration_lines(database: Database, take: str) -> list[str]:
     # without a dome, or ingested before calibrations were checked
     if "calibration" not in capture.children:
         return []
-    calibration = capture["calibration"].to_dataset()
+    calibration = capture["calibration"].dataset
     return [
         *skindb.ingest.calibration_lines(calibration),
         *aligned(skindb.ingest.calibration_table(calibration)),

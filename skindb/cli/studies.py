@@ -188,7 +188,7 @@ def _run_study(
         if plot:
             skindb.analysis.plot_study(results, plot)
         if out:
-            model = results["face_model"].to_dataset().load()
+            model = results["face_model"].dataset.load()
             skindb.analysis.write_face_model(model, out)
     _report(database, study, results, csv)
 

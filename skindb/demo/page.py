@@ -54,7 +54,7 @@ def portrait(model: xr.DataTree) -> Image:
     """Linear radiance (h, w, 3) of the model from the front under two lights of the dome,
     one from each side.
     """
-    dome = model["dome"].to_dataset().load()
+    dome = model["dome"].dataset.load()
     towards = unit(dome[variables.LIGHT_POSITION].values)
     nearest = np.argmax(unit(np.array(KEY_LIGHTS)) @ towards.T, axis=1)
     names = [str(dome["light"].values[i]) for i in nearest]
@@ -85,7 +85,7 @@ def map_pictures(
 
 def _maps(model: xr.DataTree) -> list[tuple[Picture, Mask, str]]:
     surface = from_model(model)
-    camera, _ = chosen_camera(model["dome"].to_dataset().load(), None)
+    camera, _ = chosen_camera(model["dome"].dataset.load(), None)
     view = trace_view(surface, camera.scaled(1.2), samples=2)
     shine = surface.model.normal_reflectance(view.interpolate(surface.parameters))
     pictures = [
@@ -96,7 +96,7 @@ def _maps(model: xr.DataTree) -> list[tuple[Picture, Mask, str]]:
     if surface.sigma_tr is not None:
         depth = np.clip(1 / view.interpolate(surface.sigma_tr) / 3, 0, 1)
         pictures.append((encode_srgb(depth), "translucency 1/sigma_tr, 0 to 3 mm"))
-    fitted = model["fitted"].to_dataset()
+    fitted = model["fitted"].dataset
     for name, top, text in ERRORS:
         if name in fitted:
             values = view.interpolate(np.nan_to_num(fitted[name].values)[:, None])[:, 0]

@@ -138,7 +138,7 @@ def model_with_summary(model: DataTree) -> DataTree:
 def tables_of(model: DataTree) -> Dataset:
     """What is kept beside a model: its summary for cohorts, and how well it predicts."""
     tables = summary_tables(model)
-    prediction = prediction_table(model["fitted"].to_dataset().load())
+    prediction = prediction_table(model["fitted"].dataset.load())
     # a region without any surfel has no row there
     rows = prediction.reindex(
         region=tables["region"].values, fill_value={variables.PREDICTION_SURFELS: 0}
@@ -166,7 +166,7 @@ def registered_parts(
     """Groups and tables that cohorts need of a registered take: maps, and the regions
     that its landmarks give.
     """
-    fitted = model["fitted"].to_dataset().load()
+    fitted = model["fitted"].dataset.load()
     masks = take_masks(model, registered)
     groups = {"maps": common_maps(model, registered, size=size)}
     if sampled := sample_groups(model):
@@ -206,7 +206,7 @@ def _registered_model(db: Database, record: Record) -> tuple[DataTree, Dataset]:
     """The model of a registration, and the group "registration"."""
     version = db.version(record, ["registration"])
     model = db.source(version, "model", record.take, SURFACE)
-    return model, version["registration"].to_dataset()
+    return model, version["registration"].dataset
 
 
 def _commit_summary(
@@ -369,7 +369,7 @@ def registered_datasets(
     out = {}
     for take, record in records.items():
         version = db.version(record, ["registration"])
-        ds = version["registration"].to_dataset()
+        ds = version["registration"].dataset
         small = {name: ds[name].load() for name in ds if "surfel" not in ds[name].dims}
         out[take] = ds.assign(small)
     return out

@@ -193,8 +193,8 @@ def basis_grid(
     """
     model = db.read("model", take)
     db.require_consent(take, "export")
-    require_mixture(model["fitted"].to_dataset(), f"model of {take}")
-    names = model["fitted"].to_dataset()["dictionary"].values.tolist()
+    require_mixture(model["fitted"].dataset, f"model of {take}")
+    names = model["fitted"].dataset["dictionary"].values.tolist()
     tables = studies.dictionary_tables(
         names, float(model[f"basis/{variables.DISC_ANGULAR_RADIUS}"]), dictionary
     )
@@ -234,7 +234,7 @@ def _root_mean_square(values: Float32) -> float:
 
 def _frontal_light(model: DataTree) -> str:
     """The light whose direction is nearest to that of the frontal camera."""
-    dome = model["dome"].to_dataset().load()
+    dome = model["dome"].dataset.load()
     seen_from = dome[variables.CAMERA_POSITION].values[frontal_camera(dome)]
     place = dome[variables.LIGHT_POSITION].values
     cosine = place @ seen_from / lengths(place)
@@ -245,7 +245,7 @@ def _grid_scale(model: DataTree) -> float:
     """Size of the pictures of a grid over that of the camera's: few pixels, of which
     each costs every light.
     """
-    dome = model["dome"].to_dataset()
+    dome = model["dome"].dataset
     return GRID_SIDE / float(dome[variables.CAMERA_SIZE].max())
 
 
@@ -266,12 +266,12 @@ def editable_model(
     model, vectors = map(db.version, inputs)
     db.require_consent(take, "statistics")
     require_fresh(db, STUDY, study)
-    require_mixture(model["fitted"].to_dataset(), f"model of {take}")
-    brdfs = model["fitted"].to_dataset()["dictionary"].values.tolist()
+    require_mixture(model["fitted"].dataset, f"model of {take}")
+    brdfs = model["fitted"].dataset["dictionary"].values.tolist()
     textures, registrations = _registered_textures(db, take, model, vectors)
     inputs += registrations
     traits, basis, albedo = (
-        vectors[name].to_dataset().compute()
+        vectors[name].dataset.compute()
         for name in ("traits", "population_basis", "albedo")
     )
     tables = studies.dictionary_tables(
@@ -313,7 +313,7 @@ def _registered_textures(
     if not records:
         return {}, []
     registered = registered_datasets(db, records)[take]
-    texture = vectors["texture"].to_dataset().compute()
+    texture = vectors["texture"].dataset.compute()
     maps = common_maps(model, registered, size=texture.sizes["v"])
     arguments = {"texture": texture, "maps": maps, "registered": registered}
     return arguments, [records[take]]

@@ -259,12 +259,12 @@ def _correction(tree: xr.DataTree) -> tuple[Float64, float, float] | None:
     """Matrix (4, 4) that moves the scan to where the photographs show it, and its shift in
     mm and turn in degrees; None if they show too little of the face.
     """
-    calibration = tree["calibration"].to_dataset()
+    calibration = tree["calibration"].dataset
     shift = calibration[variables.SCAN_TRANSLATION_ERROR].values
     angles = calibration[variables.SCAN_ROTATION_ERROR].values
     if not np.isfinite([*shift, *angles]).all():
         return None
-    surfels = tree["surfels"].to_dataset()
+    surfels = tree["surfels"].dataset
     middle = float64(surfels[variables.SURFEL_POSITION].values).mean(axis=0)
     turn = Rotation.from_rotvec(angles, degrees=True)
     matrix = rigid(turn, middle + shift - turn.apply(middle))

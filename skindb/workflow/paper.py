@@ -201,11 +201,11 @@ def _lumitexels(source: Source, picture: Path) -> list[str]:
 
     source.db.require_consent(source.take, "export")
     capture = source.db.read("capture", source.take)
-    samples, dome = (capture[name].to_dataset() for name in ("samples", "dome"))
+    samples, dome = (capture[name].dataset for name in ("samples", "dome"))
     counts = samples[variables.SAMPLE_COUNT].values
     _, axes = pyplot.subplots(1, 2, figsize=(7, 3.4))
     # the best seen surfels on both sides of the median height of the seen ones
-    surfels = capture["surfels"].to_dataset()
+    surfels = capture["surfels"].dataset
     height = surfels[variables.SURFEL_POSITION].values[:, 1]
     upper = height > np.median(height[counts > 0])
     for ax, is_part, part in zip(axes, (upper, ~upper), PARTS, strict=True):
@@ -265,7 +265,7 @@ def _profiles(source: Source, picture: Path) -> list[str]:
     source.db.require_consent(source.take, "export")
     capture = source.db.read("capture", source.take)
     require("probe" in capture, source.take, "must have profiles of the probe", "none")
-    probe = capture["probe"].to_dataset()
+    probe = capture["probe"].dataset
     distance = probe[variables.FIBRE_DISTANCE].values
     order = np.argsort(distance)
     sites = probe["site"].values.tolist()
@@ -345,7 +345,7 @@ def _components(source: Source, picture: Path) -> list[str]:
 
 def _spheres(source: Source, picture: Path) -> list[str]:
     space = source.study("surface", group_by="condition")
-    write_plot(plot_group_spheres(space["brdf_space"].to_dataset().load()), picture)
+    write_plot(plot_group_spheres(space["brdf_space"].dataset.load()), picture)
     return ["Mean surface BRDFs over subjects; those of the paper are of one."]
 
 

@@ -283,7 +283,7 @@ def _diffusion_lengths(db: Database, site: str) -> dict[str, float]:
 
 def _nose(model: DataTree) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Tip of the nose (3,), or the middle of the surfels."""
-    mesh = model["mesh"].to_dataset()
+    mesh = model["mesh"].dataset
     landmarks = mesh["landmark"].values.tolist() if "landmark" in mesh.coords else []
     if variables.LANDMARK_POSITION in mesh and LANDMARK in landmarks:
         return float64(mesh[variables.LANDMARK_POSITION].sel(landmark=LANDMARK).values)
@@ -294,7 +294,7 @@ def _nose(model: DataTree) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 def _close_up(model: DataTree) -> Camera:
     """A camera that looks at the edge of the nose's shadow from the front."""
-    frontal, _ = chosen_camera(model["dome"].to_dataset().load(), None)
+    frontal, _ = chosen_camera(model["dome"].dataset.load(), None)
     # beside the nose, on the side away from the light
     place = _nose(model) + np.array([-17.0, -2.0, -14.0])
     seen = frontal.R @ place + frontal.t

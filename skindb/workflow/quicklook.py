@@ -147,8 +147,8 @@ def _naming(source: str | Path, folder: str) -> Iterator[None]:
 
 def _write_maps(model: DataTree, out: Path, step: int) -> Json:
     """Write the maps on the grid of the points, and describe them."""
-    fitted = model["fitted"].to_dataset().load()
-    dome = model["dome"].to_dataset()
+    fitted = model["fitted"].dataset.load()
+    dome = model["dome"].dataset
     lens = [
         dome[f"camera_{name}"].values[0].astype(np.float64)
         for name in ("matrix", "rotation", "translation", "distortion")

@@ -109,7 +109,7 @@ def calibrate_rig(
         cameras.append(camera_gains)
         if "statistics" in db.consent(take):
             eta = float(fitted["fitted"][variables.REFRACTIVE_INDEX])
-            regions = own_masks(capture["surfels"].to_dataset())
+            regions = own_masks(capture["surfels"].dataset)
             gloss.append(take_gloss(lumitexels(capture), eta=eta, regions=regions))
         inputs += [record, model]
     names = [*positions]
@@ -141,7 +141,7 @@ def describe_rig(db: Database, record: Record) -> dict[str, Any]:
     takes: their spread, errors, and the spread that they leave in a held-out take.
     """
     stored = db.version(record)
-    rig = stored[RIG].to_dataset().load()
+    rig = stored[RIG].dataset.load()
     count = rig[variables.RIG_TAKES].values
     few = rig["light"].values[count < MIN_TAKES]
     position = rig[variables.RIG_LIGHT_POSITION].values
@@ -195,7 +195,7 @@ def _lights(record: Record, capture: DataTree) -> dict[str, Float64]:
     take = record.take
     rule = "a calibration from takes needs captures with a dome"
     require("dome" in capture.children, take, rule, "none", "name other takes")
-    dome = capture["dome"].to_dataset()
+    dome = capture["dome"].dataset
     is_from_setup = (
         record.provenance.get("calibrated_by")
         and variables.LIGHT_GAIN_APPLIED not in dome
