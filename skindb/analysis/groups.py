@@ -338,23 +338,17 @@ def _test_summary(part: Dataset, count: int, smallest_p: float) -> str:
 
 def _detectable_line(name: str, part: Dataset) -> list[str]:
     """A line with the smallest detectable differences, if any is known."""
-    detectable = [
-        f"{quantity} {_amount(value, quantity in part.attrs['logarithmic'])}"
-        for quantity, value in zip(
-            part["quantity"].values,
-            part[variables.EFFECT_DETECTABLE].values,
-            strict=True,
-        )
-        if np.isfinite(value)
-    ]
+    detectable = []
+    known = part[variables.EFFECT_DETECTABLE].to_series()
+    for quantity, value in known[np.isfinite(known)].items():
+        amount = f"{value:.2g}"
+        if quantity in part.attrs["logarithmic"]:
+            amount = f"{100 * np.expm1(value):.0f} %"
+        detectable.append(f"{quantity} {amount}")
     if not detectable:
         return []
     listed = few_names(detectable, MAX_LISTED)
     return [f"{name}: detectable differences (power 80 %): {listed}"]
-
-
-def _amount(value: float, is_log: bool) -> str:
-    return f"{100 * np.expm1(value):.0f} %" if is_log else f"{value:.2g}"
 
 
 def plot_group_effects(table: Dataset, *, ax: Axes | None = None) -> Axes:

@@ -287,8 +287,3 @@ def command(function: Command) -> click.Command:
 def asked(name: str) -> Any:
     """Value of an option that is kept in the context; None if the command does not have it."""
     return click.get_current_context().meta.get(name)
-
-
-def progress_style() -> str:
-    """How the running command shows its progress: bar, json or none."""
-    return "none" if asked("no_progress") else asked("progress") or "bar"

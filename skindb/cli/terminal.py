@@ -13,7 +13,7 @@ from shutil import get_terminal_size
 
 import click
 
-from skindb.cli.options import progress_style
+from skindb.cli.options import asked
 from skindb.errors import escaped
 
 MIN_INTERVAL_S = {"bar": 0.2, "json": 1.0}  # between two reports of the same stage
@@ -200,4 +200,5 @@ def bar(*, plain: bool = False) -> Progress:
     """Progress in the style of the running command; `plain` for long commands whose
     output goes to a file.
     """
-    return Progress(progress_style(), plain=plain)
+    style = "none" if asked("no_progress") else asked("progress") or "bar"
+    return Progress(style, plain=plain)

@@ -101,7 +101,13 @@ def read_probe(folder: Path, fields: Fields) -> ProbeRecord:
         else ("",)
         for site in sites
     }
-    frames = _template(fields, exposures, placements)
+    # a placeholder for all that differs between the frames
+    needed = {SITE}
+    if len(exposures) > 1:
+        needed.add(EXPOSURE)
+    if any(len(names) > 1 for names in placements.values()):
+        needed.add(PLACEMENT)
+    frames = fields.template("frames", needed, {EXPOSURE, PLACEMENT})
     linear = is_linear(frames)
     if linear:
         require_merged(fields, exposures)
@@ -110,7 +116,14 @@ def read_probe(folder: Path, fields: Fields) -> ProbeRecord:
         folder=folder,
         sites=sites,
         placements=placements,
-        azimuth=np.array([_azimuth(fibre) for fibre in fibres]),
+        azimuth=np.array(
+            [
+                fibre.number("azimuth", minimum=-360.0, maximum=360.0)
+                if fibre.has("azimuth")
+                else np.nan
+                for fibre in fibres
+            ]
+        ),
         distance=np.array([fibre.number("distance", above=0.0) for fibre in fibres]),
         centre=centre.reshape(-1, 2),
         radius=np.array([fibre.number("radius", above=0.0) for fibre in fibres]),
@@ -134,26 +147,6 @@ def read_probe(folder: Path, fields: Fields) -> ProbeRecord:
         _require_even_gains(fields, probe.gain)
     _check_frames(probe, fields)
     return probe
-
-
-def _template(
-    fields: Fields,
-    exposures: Mapping[str, float],
-    placements: Mapping[str, tuple[str, ...]],
-) -> str:
-    """Template of the frames, with a placeholder for all that differs between them."""
-    needed = {SITE}
-    if len(exposures) > 1:
-        needed.add(EXPOSURE)
-    if any(len(names) > 1 for names in placements.values()):
-        needed.add(PLACEMENT)
-    return fields.template("frames", needed, {EXPOSURE, PLACEMENT})
-
-
-def _azimuth(fibre: Fields) -> float:
-    if not fibre.has("azimuth"):
-        return np.nan
-    return fibre.number("azimuth", minimum=-360.0, maximum=360.0)
 
 
 def _check_frames(probe: ProbeRecord, fields: Fields) -> None:
@@ -210,9 +203,10 @@ def _log(value: Any) -> Log | None:
     if not isinstance(value, list) or not 0 < len(value) <= MAX_PRESSURE_SAMPLES:
         return None
     for pair in value:
-        if not isinstance(pair, list) or len(pair) != 2:
-            return None
-        if not all(is_number(x) and abs(x) <= MAX_MAGNITUDE for x in pair):
+        is_pair = isinstance(pair, list) and len(pair) == 2
+        if not is_pair or not all(
+            is_number(x) and abs(x) <= MAX_MAGNITUDE for x in pair
+        ):
             return None
     log = np.array(value, float)
     return log if (np.diff(log[:, 0]) > 0).all() else None
@@ -232,10 +226,9 @@ def _require_separate_fibres(fields: Fields, probe: ProbeRecord) -> None:
         cure = "give the distances in mm"
         fields.fault("fibres", rule, f"{distance.max():g} mm", cure)
     elif len(distance) > 1 and np.ptp(distance) == 0:
-        rule = "a profile needs fibres at different distances"
         fields.fault(
             "fibres",
-            rule,
+            "a profile needs fibres at different distances",
             f"all {len(distance)} at {distance[0]:g} mm",
             "give each fibre its own distance",
         )
@@ -249,14 +242,8 @@ def _require_separate_fibres(fields: Fields, probe: ProbeRecord) -> None:
             "distance is measured between the centres; both are in mm, and "
             "fibre_radius is not the diameter"
         )
-        fields.faults.append(
-            Fault(
-                f"{fields.where}[fibres][{i}][distance]",
-                rule,
-                f"{distance[i]:g} mm",
-                cure,
-            )
-        )
+        place = f"{fields.where}[fibres][{i}][distance]"
+        fields.faults.append(Fault(place, rule, f"{distance[i]:g} mm", cure))
     _require_separate_discs(fields, probe.centre, probe.radius)
 
 

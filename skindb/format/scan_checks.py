@@ -306,23 +306,16 @@ def device_faults(where: str, dome: DomeRecord, surface: CleanMesh) -> list[Faul
         ("cameras", {camera.id: camera.centre for camera in dome.cameras}),
         ("lights", {light.id: light.position for light in dome.lights}),
     ):
-        far = [
-            name
-            for name, position in positions.items()
-            if np.linalg.norm(position) > MAX_DEVICE_DISTANCE_MM
-        ]
-        inner = [
-            name for name, position in positions.items() if _inside(surface, position)
-        ]
+        far = [n for n, p in positions.items() if lengths(p) > MAX_DEVICE_DISTANCE_MM]
+        inner = [n for n, p in positions.items() if _inside(surface, p)]
         if far:
             rule = (
                 f"{key} must be within {MAX_DEVICE_DISTANCE_MM / 1000:g} m of the "
                 "origin of the scan's frame"
             )
             finding = f"{len(far)} of {len(positions)} farther: {_first_names(far)}"
-            faults.append(
-                Fault(f"{where}[{key}]", rule, finding, "give positions in mm")
-            )
+            cure = "give positions in mm"
+            faults.append(Fault(f"{where}[{key}]", rule, finding, cure))
         if inner:
             cure = "calibrate in mm and in the frame of the scan; a camera is at -R^T t"
             if len(inner) == len(positions):
@@ -420,8 +413,7 @@ def _inside(surface: CleanMesh, point: Float64) -> bool:
     vertices = surface.vertices
     if not ((point > vertices.min(axis=0)) & (point < vertices.max(axis=0))).all():
         return False
-    number = winding_number(vertices, surface.faces, point)[0]
-    return bool(number > MIN_WINDING_NUMBER)
+    return bool(winding_number(vertices, surface.faces, point) > MIN_WINDING_NUMBER)
 
 
 def picture_span(camera: CameraRecord, vertices: Float64) -> float | None:

@@ -110,20 +110,10 @@ def cohort(
 ) -> Dataset:
     """See `Database.cohort`."""
     layout = request.layout
-    require(
-        layout in GROUP,
-        "layout",
-        f"must be one of {', '.join(GROUP)}",
-        repr(layout),
-        "choose one",
-    )
-    require(
-        dim in ("take", "subject"),
-        "dim",
-        "must be take or subject",
-        repr(dim),
-        "choose one",
-    )
+    rule = f"must be one of {', '.join(GROUP)}"
+    require(layout in GROUP, "layout", rule, repr(layout), "choose one")
+    rule = "must be take or subject"
+    require(dim in ("take", "subject"), "dim", rule, repr(dim), "choose one")
     base = "registration" if layout == "maps" else kind
     names, skipped = _members(lookup, base, takes)
     records = {take: lookup.record(base, take) for take in names}
@@ -223,14 +213,9 @@ def _members(
         cure = f"takes with one: {', '.join(available) or 'none'}"
         raise InputError(Fault(take, rule, "none", cure) for take in unknown)
     if not names:
-        cure = (
-            "run skindb register first"
-            if kind == "registration"
-            else "run skindb fit first"
-        )
-        raise input_error(
-            lookup.place.name, "a study needs fitted takes", f"no {kind}", cure
-        )
+        cure = f"run skindb {'register' if kind == 'registration' else 'fit'} first"
+        rule = "a study needs fitted takes"
+        raise input_error(lookup.place.name, rule, f"no {kind}", cure)
     allowed = []
     skipped = []
     lacks_registration = False
@@ -238,12 +223,10 @@ def _members(
         if "statistics" not in lookup.scope(take):
             skipped.append(note(take, "its consent does not cover statistics"))
         elif kind == "registration" and not _is_of_current_model(lookup, take):
-            skipped.append(
-                note(
-                    take,
-                    "its registration was made from an earlier model; run skindb register",
-                )
+            text = (
+                "its registration was made from an earlier model; run skindb register"
             )
+            skipped.append(note(take, text))
             lacks_registration = True
         else:
             allowed.append(take)
@@ -276,9 +259,8 @@ def _largest_frame(lookup: Lookup, takes: Sequence[str]) -> tuple[list[str], lis
     """
     frames: dict[str, list[str]] = {}
     for take in takes:
-        frames.setdefault(frame_of(lookup.record("registration", take)), []).append(
-            take
-        )
+        frame = frame_of(lookup.record("registration", take))
+        frames.setdefault(frame, []).append(take)
     largest = max(frames.values(), key=len, default=[])
     return largest, [take for take in takes if take not in set(largest)]
 
@@ -298,11 +280,12 @@ def frame_of(registration: Record) -> str:
 
 def _coords(lookup: Lookup, take: str) -> dict[str, Any]:
     """Coordinates of a take: attributes of its capture and parameters of its model."""
-    model = lookup.record("model", take) if lookup.has("model", take) else None
-    coords = take_coords(
-        take, lookup.about(take), None if model is None else model.provenance
-    )
-    return coords | ({} if model is None else {"model_generation": model.generation})
+    about = lookup.about(take)
+    if not lookup.has("model", take):
+        return take_coords(take, about, None)
+    model = lookup.record("model", take)
+    generation = {"model_generation": model.generation}
+    return take_coords(take, about, model.provenance) | generation
 
 
 def _stored_record(
@@ -332,11 +315,8 @@ def _has_data_for(record: Record, request: CohortRequest) -> bool:
         return False
     contents = record.contents.get(GROUP[request.layout])
     if contents is None:  # the take of a summary without a sample has no fitted surfels
-        return (
-            request.layout == "surfels"
-            and record.kind == SUMMARY
-            and "tables" in record.contents
-        )
+        has_tables = record.kind == SUMMARY and "tables" in record.contents
+        return request.layout == "surfels" and has_tables
     if request.layout == "surfels":
         count = int(contents["sizes"]["surfel"])
         # fewer than requested: the sample contains all fitted surfels

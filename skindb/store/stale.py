@@ -99,7 +99,9 @@ class Staleness:
         self._cache = cache
         self._snapshot = Snapshot(db.place)
         self._known: dict[Key, tuple[Reason, ...]] = {}
-        self._newest_of = cached(self._find_newest)
+        self._newest_of = cached(
+            lambda kind, take: self._records(kind).record(kind, take).generation
+        )
         self._is_covered = cached(self._find_cover)
 
     def reasons(self, record: Record) -> tuple[Reason, ...]:
@@ -155,10 +157,6 @@ class Staleness:
         """
         scope = intact_or_none(partial(consent_of, self._records(CONSENT), take))
         return scope is not None and "statistics" in scope
-
-    def _find_newest(self, kind: str, take: str) -> int:
-        """Generation of the newest version of a take."""
-        return self._records(kind).record(kind, take).generation
 
     def _records(self, kind: str) -> Records:
         if self._cache is not None and kind in CACHED_KINDS:

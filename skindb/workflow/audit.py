@@ -59,6 +59,16 @@ class NotLoggedWarning(SkindbWarning):
 
 
 @contextmanager
+def _set_to(variable: ContextVar[Item], value: Item) -> Iterator[None]:
+    """Context in which a variable has a value."""
+    token = variable.set(value)
+    try:
+        yield
+    finally:
+        variable.reset(token)
+
+
+@contextmanager
 def acting_as(actor: str) -> Iterator[None]:
     """Context in which actions are logged under this name in place of that of the
     operating system's user.
@@ -68,11 +78,8 @@ def acting_as(actor: str) -> Iterator[None]:
     InputError
         If the name is empty, longer than 64 characters, or cannot be printed.
     """
-    token = _stated_actor.set(_checked_actor("actor", actor))
-    try:
+    with _set_to(_stated_actor, _checked_actor("actor", actor)):
         yield
-    finally:
-        _stated_actor.reset(token)
 
 
 @contextmanager
@@ -117,11 +124,10 @@ def logged_action(
         If another action cannot be logged; it is done all the same.
     """
     running = _logged_databases.get()
-    recorded = {name: arguments.get(name) for name in RECORDED}
     parameters |= {
         name: value
-        for name, value in recorded.items()
-        if isinstance(value, int) and value
+        for name in RECORDED
+        if isinstance(value := arguments.get(name), int) and value
     }
     entry = {
         "takes": list(takes),
@@ -132,11 +138,8 @@ def logged_action(
     error = None if db in running else _log(db, action, entry)
     if error is not None and action not in ERASURES:
         _warn(db, action, error)
-    token = _logged_databases.set((*running, db))
-    try:
+    with _set_to(_logged_databases, (*running, db)):
         yield
-    finally:
-        _logged_databases.reset(token)
     # which may have freed the space that an entry needs
     if error is not None and action in ERASURES:
         error = _log(db, action, entry)
@@ -182,11 +185,8 @@ def as_part(function: Callable[[Item], Result]) -> Callable[[Item], Result]:
 def _call_as_part(
     function: Callable[[Item], Result], running: tuple[Database, ...], item: Item
 ) -> Result:
-    token = _logged_databases.set(running)
-    try:
+    with _set_to(_logged_databases, running):
         return function(item)
-    finally:
-        _logged_databases.reset(token)
 
 
 def _takes_of(arguments: Attributes) -> list[str]:
@@ -224,11 +224,10 @@ def _actor() -> str:
     """Who acts: the name that was stated, that of the environment, or the user of the
     operating system.
     """
-    stated = _stated_actor.get()
-    if stated:
+    if stated := _stated_actor.get():
         return stated
-    if os.environ.get(ACTOR):
-        return _checked_actor(ACTOR, os.environ[ACTOR])
+    if named := os.environ.get(ACTOR):
+        return _checked_actor(ACTOR, named)
     try:
         return pwd.getpwuid(os.getuid()).pw_name
     except KeyError:  # for example in a container
