@@ -94,16 +94,10 @@ def write_geometry(folder: Path, record: Json, positions: xr.Dataset) -> None:
     """Replace the dome.json of a set-up by one with calibrated cameras and lights, which face
     the origin. One that had cameras is kept as dome.1.json, dome.2.json, ...
     """
-    place = dict(
-        zip(
-            map(str, positions["light"].values),
-            positions[variables.CALIBRATED_POSITION].values.tolist(),
-            strict=True,
-        )
-    )
+    places = positions[variables.CALIBRATED_POSITION]
     lights = [
         {key: light[key] for key in light if key not in ("axis", "direction")}
-        | {"position": place[light["id"]]}
+        | {"position": places.sel(light=light["id"]).values.tolist()}
         for light in record["lights"]
     ]
     file = folder / "dome/dome.json"

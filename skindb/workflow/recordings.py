@@ -157,7 +157,9 @@ def record_target(
             for key, name in kept.items():
                 copy_frame(run.frames[key], out / f"{name}{run.frames[key].suffix}")
             notes += run.notes
-        return _written(out, kind, places, laboratory, seconds) | {"notes": notes}
+        suffix = next(out.glob(f"{next(iter(kept.values()))}.*")).suffix
+        report = _written(out, kind, places, laboratory, seconds, suffix)
+        return report | {"notes": notes}
 
 
 def _require_options(parameters: SessionParameters) -> None:
@@ -311,19 +313,10 @@ def _written(
     places: int,
     laboratory: Setup,
     seconds: Mapping[str, float],
+    suffix: str,
 ) -> Json:
     """Name the frames in the file that `calibrate` reads; a board is calibrated."""
     cameras = laboratory.dome.camera_ids
-    first = filled(
-        TEMPLATES[kind],
-        camera=cameras[0],
-        light=laboratory.dome.light_ids[0],
-        exposure=next(iter(seconds)),
-        repeat="1",
-        pose="1",
-        place="1",
-    )
-    suffix = next(out.glob(f"{first}.*")).suffix
     frames = {"frames": f"{TEMPLATES[kind]}{suffix}"}
     file = out / (NEEDED[kind][0] if kind in NEEDED else setup.FILE)
     record = read_json(file, []) if file.is_file() else {}
@@ -344,9 +337,8 @@ def _written(
         record["exposures"] = [{"id": e, "seconds": s} for e, s in seconds.items()]
     write_record(file, record)
     report = {"path": str(out), "kind": kind, "places": places}
-    report["frames"] = sum(
-        1 for _ in out.glob(re.sub(r"\{.*?\}", "*", TEMPLATES[kind]) + suffix)
-    )
+    pattern = re.sub(r"\{.*?\}", "*", TEMPLATES[kind]) + suffix
+    report["frames"] = len(list(out.glob(pattern)))
     if kind == "board":
         found = boards.calibrate_cameras(boards.read_boards(out))
         report["rms_px"] = {name: one.rms for name, one in found.items()}
