@@ -28,9 +28,12 @@ from skindb.types import Array, Float32, Mask, dots, finite_rows, lengths, unit
 
 Image = Float32
 FAR = 1e5  # mm, length of shadow rays towards an environment
-DIRECTIONS = (
-    32  # of an environment at each point, by luminance and as many by the cosine
-)
+# of an environment at each point, by luminance and as many by the cosine
+DIRECTIONS = 32
+MIN_DIRECTIONS = 2
+# of all points of a pass, above which points have fewer directions: a receiver averages the
+# light of more points the denser they are
+MAX_DIRECTIONS = 4_000_000
 # steps of an additive recurrence that fills the unit square evenly (Roberts 2018)
 STEPS = np.array([0.7548776662466927, 0.5698402909980532])
 MIN_PASSES = (
@@ -194,7 +197,9 @@ def _from_environment(
     received = np.zeros((len(points), 3))
     tangent, second = tangents(normals)
     start = rng.random((len(points), 2))
-    for i in range(DIRECTIONS):
+    most = MAX_DIRECTIONS // max(len(points), 1)
+    directions = int(np.clip(most, MIN_DIRECTIONS, DIRECTIONS))
+    for i in range(directions):
         draw = (start + i * STEPS) % 1
         height = np.sqrt(draw[:, :1])
         sine = np.sqrt(1 - height**2)
@@ -211,7 +216,7 @@ def _from_environment(
             passed = fresnel_transmittance(np.minimum(cosine[lit], 1), eta)
             weight = cosine[lit] * passed / density
             received[lit] += weight[:, None] * environment.along(towards[lit])
-    return received / DIRECTIONS
+    return received / directions
 
 
 def refined_surface(

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
+from scipy.integrate import quad
 from scipy.interpolate import LinearNDInterpolator
 
 from skindb.geometry.rays import RayScene
@@ -16,8 +18,19 @@ from skindb.optics.diffusion import (
 )
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.mixture import Mixture
-from skindb.render.scene import Camera, Lighting, Lights, Surface, subdivide_surface
-from skindb.render.subsurface import refined_surface, subsurface_light
+from skindb.render.scene import (
+    Camera,
+    Environment,
+    Lighting,
+    Lights,
+    Surface,
+    subdivide_surface,
+)
+from skindb.render.subsurface import (
+    received_irradiance,
+    refined_surface,
+    subsurface_light,
+)
 from tests.pictures import render_view
 
 HALF = 20.0  # mm, of the side of the square
@@ -124,6 +137,31 @@ def test_subsurface_light__at_a_shadow_and_at_a_bright_spot_is_the_sum() -> None
         found = LinearNDInterpolator(fine.vertices[flat, :2], light[flat])(at)
         off = np.sqrt(np.mean((found - true) ** 2, axis=0)) / true.max(axis=0)
         assert (off < 0.006).all()
+
+
+@pytest.mark.parametrize("most", [4_000_000, 1])
+def test_received_irradiance__of_even_surroundings_with_many_and_few_directions(
+    most, monkeypatch
+) -> None:
+    """The wall hides a quarter of the sphere, which is half of the light."""
+    monkeypatch.setattr("skindb.render.subsurface.MAX_DIRECTIONS", most)
+    surface = skin(8)
+    lighting = Lighting(None, Environment(np.ones((8, 16, 3))))
+    points = np.tile([EDGE + 1e-3, 0, 0], (4000, 1))
+    scene = RayScene(surface.vertices, surface.faces)
+    received = received_irradiance(
+        points,
+        np.tile([0.0, 0, 1], (len(points), 1)),
+        lighting,
+        scene,
+        eta=ETA,
+        rng=np.random.default_rng(0),
+    )
+    whole = (
+        2 * np.pi * quad(lambda c: c * float(fresnel_transmittance(c, ETA)), 0, 1)[0]
+    )
+    error = received.std(axis=0) / np.sqrt(len(points))
+    np.testing.assert_array_less(np.abs(received.mean(axis=0) - whole / 2), 4 * error)
 
 
 def test_refined_surface__divides_triangles_where_light_changes() -> None:
