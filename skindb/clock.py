@@ -1,7 +1,10 @@
 """Time as a parameter: the clock of this computer, and a simulated one for emulated devices."""
 
+import signal
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import Protocol
 
@@ -50,12 +53,29 @@ class SimulatedClock:
         end = self._seconds + seconds
         while self._seconds < end:
             self._seconds = min(self._seconds + TICK_SECONDS, end)
-            for act in self._actors:
-                act()
+            with _uninterrupted():
+                for act in self._actors:
+                    act()
 
     def time(self) -> float:
         """Simulated seconds since 1970."""
         return self._start + self._seconds
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Context at whose end Ctrl-C takes effect: devices do not stop in the midst of an act."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    pressed = list[int]()
+    handler = signal.signal(signal.SIGINT, lambda number, _: pressed.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+        if pressed:
+            signal.raise_signal(signal.SIGINT)
 
 
 SYSTEM_CLOCK: Clock = time  # that of this computer

@@ -1,0 +1,26 @@
+"""Tests of the simulated clock."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+
+from skindb.clock import TICK_SECONDS, SimulatedClock
+
+
+def test_simulated_clock__ctrl_c_waits_until_devices_have_acted():
+    """A device that stops in the midst of an act would have a state that no device has."""
+    clock = SimulatedClock()
+    acted = []
+
+    def act():
+        signal.raise_signal(signal.SIGINT)
+        acted.append(clock.monotonic())
+
+    clock.attach(act)
+    clock.attach(act)
+    with pytest.raises(KeyboardInterrupt):
+        clock.sleep(1.0)
+    assert acted == [TICK_SECONDS, TICK_SECONDS]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
