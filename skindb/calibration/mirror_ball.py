@@ -305,7 +305,8 @@ def ball_places(
         "mirror ball",
         f"its highlights must be those of a ball of radius {radius:g} mm",
         f"of {found:.3g} +- {found * spread:.1g} mm, missed by {miss:.1g} mm",
-        "give the radius of the ball in mm, and remove other bright things from the pictures",
+        "correct the radius of the ball or the squares of the board (mm), and remove other bright "
+        "things from the pictures",
     )
     of_size = {"x_scale": scale[:-1], "args": (radius,)}
     fit = adjust(best[:-1], loss=loss, f_scale=outlier, **of_size)
