@@ -67,7 +67,11 @@ def main(page: Path) -> None:
         browser.close()
     for name, samples in times.items():
         gesture, _, fraction = name.rpartition(" ")
-        size = "800 x 600" if fraction == "1" else "400 x 300 (while moving)"
+        size = (
+            "800 x 600"
+            if fraction == "1"
+            else "400 x 300 (while moving, shown at 800 x 600)"
+        )
         median = sorted(samples)[ROUNDS // 2]
         turn = sorted(times[f"turn {fraction}"])[ROUNDS // 2]
         print(

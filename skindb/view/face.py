@@ -46,7 +46,7 @@ MEASURED = (  # differences from skindb render (docs/howto/view.md)
     ),
     (
         "light under the skin as one Gaussian in a texture of 384 texels: pictures "
-        "differ by 1.0 %, and by 1.5 % while something moves (measured)"
+        "differ by 1.0 %, and by 1.4 % while something moves (measured)"
     ),
     (
         "light from all directions as harmonics of visibility and 256 reflected lights: "

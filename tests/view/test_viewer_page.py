@@ -225,7 +225,7 @@ def test_page__light_under_the_skin_is_near_that_of_the_octree(
     without, _ = compared(local, expected, view)
     # a Gaussian stands for the dipole, and 0.7 % is the error of the viewer without it
     assert error < 0.8 * without
-    assert coarse < 0.02, coarse  # 96 texels instead of 384
+    assert coarse < 0.02, coarse  # 192 texels instead of 384
     assert not page.problems
     page.close()
 

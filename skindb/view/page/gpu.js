@@ -11,10 +11,10 @@ function isSoftware() {
   return /swiftshader|llvmpipe|software/i.test(String(name));
 }
 
-function compile(gl, name, define = "") {
+function compile(gl, name, ...defines) {
   const program = gl.createProgram();
   for (const [kind, text] of [[gl.VERTEX_SHADER, SHADERS[name].vertex], [gl.FRAGMENT_SHADER, SHADERS[name].fragment]]) {
-    const shader = gl.createShader(kind), source = define ? text.replace("\n", `\n#define ${define}\n`) : text;
+    const shader = gl.createShader(kind), source = text.replace("\n", `\n${defines.map((one) => `#define ${one}\n`).join("")}`);
     gl.shaderSource(shader, source);
     gl.compileShader(shader);
     gl.attachShader(program, shader);

@@ -1,7 +1,8 @@
 // Draws one face, or the original and the edited face side by side, into a canvas.
 "use strict";
 
-const SHADOW_SIZE = 1024, GLOW_SIZE = 384, COARSE_GLOW_SIZE = 96, FACE_HEIGHT_OVER_WIDTH = 1.5;
+const COARSE_MM = 2;  // between vertices while something moves without a graphics card, about two pixels
+const SHADOW_SIZE = 1024, GLOW_SIZE = 384, COARSE_GLOW_SIZE = 192, FACE_HEIGHT_OVER_WIDTH = 1.5;
 
 // lights in groups of at most the number that one pass can process
 function batches(lights) {
@@ -25,11 +26,13 @@ class Painter {
     this.floats = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
     this.programs = Object.fromEntries(Object.keys(SHADERS).map((name) => [name, compile(gl, name)]));
     this.programs.faceOfMany = compile(gl, "face", "SECOND_TABLE");
+    this.programs.coarse = compile(gl, "face", "COARSE");
+    this.programs.coarseOfMany = compile(gl, "face", "COARSE", "SECOND_TABLE");
     this.shadow = shadowTarget(gl, SHADOW_SIZE, MAX_LIGHTS);
     this.glows = {};
     this.empty = gl.createVertexArray();
     this.sides = {};
-    this.sum = this.sums = this.tableA = this.tableB = this.lobes = this.mirror = this.detail = null;
+    this.fewer = this.sum = this.sums = this.tableA = this.tableB = this.lobes = this.mirror = this.detail = null;
   }
 
   load(face) {
@@ -44,6 +47,12 @@ class Painter {
     }
     this.face = face;
     this.visible = new VisibleTriangles(face);
+    this.coarse = this.software ? new VisibleTriangles({ ...face, triangles: fewerTriangles(face, COARSE_MM) }) : this.visible;
+    gl.deleteBuffer(this.fewer);
+    this.fewer = gl.createBuffer();
+    gl.bindVertexArray(null);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.fewer);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, this.coarse.triangles, gl.STATIC_DRAW);
     for (const name of ["tableA", "tableB", "lobes", "detail"]) if (this[name]) gl.deleteTexture(this[name]);
     this.ambient = buffer(gl, 9, 4, gl.FLOAT, new Float32Array((4 * face.position.length) / 3));
     this.sides = Object.fromEntries(names.map((name) => [name, this.side(face)]));
@@ -67,7 +76,7 @@ class Painter {
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, face.triangles, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
     const list = gl.createBuffer();  // of the visible triangles, made again for each view
-    return { vao, buffers: [...buffers, index, list], index, list, visible: this.visible, values: face, seen: "", size: 0, glow: {}, spread: 0 };
+    return { vao, buffers: [...buffers, index, list], index, list, visible: [this.visible, this.coarse], values: face, seen: "", size: 0, glow: {}, spread: 0 };
   }
 
   // Changes the values of the edited side; `differ` is whether it differs from the plain one.
@@ -82,8 +91,7 @@ class Painter {
     side.values = values;
     if (changed.some((name) => ["position", "normal", "diffusion"].includes(name))) Object.assign(side, { glow: {}, spread: 0 });
     if (!changed.includes("position")) return;
-    const { triangles } = this.face;
-    side.visible = this.isMoved() ? new VisibleTriangles({ position: values.position, triangles }) : this.visible;
+    side.visible = this.isMoved() ? [null, null] : [this.visible, this.coarse];
     side.seen = "";
     this.shadowed = [];
   }
@@ -91,8 +99,8 @@ class Painter {
   isMoved() { return this.sides.edited && this.sides.edited.values.position !== this.face.position; }
 
   // Draws a picture, or the next part of a picture in an environment; returns the fraction that is done. With
-  // `coarse`, while something moves, the environment has a smooth reflection and, without a graphics card, light under
-  // the skin has fewer texels.
+  // `coarse`, while something moves, the environment has a smooth reflection and, without a graphics card, the face has
+  // fewer vertices, and light under the skin fewer texels.
   draw(state, coarse = false) {
     const gl = this.gl, { width, height } = this.canvas, lights = state.lights.slice(0, MAX_LIGHTS);
     if (!this.face || gl.isContextLost()) return 1;
@@ -175,7 +183,7 @@ class Painter {
     const cut = this.differ ? Math.round(state.divider * width) : width;
     for (const [name, left, size] of [["plain", 0, cut], ["edited", cut, width - cut]]) {
       if (size <= 0) continue;
-      if (!state.component) this.drawShadows(matrices, this.isMoved() ? name : "plain");
+      if (!state.component) this.drawShadows(matrices, this.isMoved() ? name : "plain", shown.coarse);
       const glow = state.glow && this.floats && state.withDiffuse && !state.component ? this.glow(name, uniforms, shown, state) : null;
       gl.bindFramebuffer(gl.FRAMEBUFFER, sums ? sums.frame : null);
       gl.viewport(0, 0, width, height);
@@ -232,7 +240,7 @@ class Painter {
   }
 
   // Draws the shadow maps of lights that have moved, or of another shape.
-  drawShadows(matrices, name) {
+  drawShadows(matrices, name, coarse) {
     const gl = this.gl, side = this.sides[name];
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.shadow.frame);
     gl.viewport(0, 0, SHADOW_SIZE, SHADOW_SIZE);
@@ -240,13 +248,22 @@ class Painter {
     gl.disable(gl.CULL_FACE);
     gl.bindVertexArray(side.vao);
     matrices.forEach((matrix, i) => {
-      if (this.shadowed[i] === name + matrix) return;
-      this.shadowed[i] = name + matrix;
+      const fine = name + matrix, fewer = `coarse ${fine}`;
+      if (this.shadowed[i] === fine || (coarse && this.shadowed[i] === fewer)) return;
+      this.shadowed[i] = coarse ? fewer : fine;
       gl.framebufferTextureLayer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, this.shadow.texture, 0, i);
       gl.clear(gl.DEPTH_BUFFER_BIT);
       setUniforms(gl, this.programs.depth, { matrix: ["mat4", matrix] });
-      gl.drawElements(gl.TRIANGLES, this.face.triangles.length, gl.UNSIGNED_INT, 0);
+      this.drawAll(side, coarse);
     });
+  }
+
+  // Draws all triangles of a side, or between fewer vertices while something moves.
+  drawAll(side, coarse) {
+    const gl = this.gl, { triangles } = coarse ? this.coarse : this.visible;
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, coarse ? this.fewer : side.index);
+    gl.drawElements(gl.TRIANGLES, triangles.length, gl.UNSIGNED_INT, 0);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, side.index);
   }
 
   // Light under the skin of a side as a texture. Sides with equal shape and translucency share it, and it stays the
@@ -280,7 +297,7 @@ class Painter {
       gl.clearColor(0, 0, 0, 0);
       gl.clear(gl.COLOR_BUFFER_BIT);
       setUniforms(gl, this.programs[program], values);
-      gl.drawElements(gl.TRIANGLES, face.triangles.length, gl.UNSIGNED_INT, 0);
+      this.drawAll(side, size === COARSE_GLOW_SIZE);
     }
     gl.bindVertexArray(this.empty);
     for (const [from, to, along] of [[light, across, [1, 0]], [across, blurred, [0, 1]]]) {
@@ -292,7 +309,7 @@ class Painter {
   }
 
   // `span` is the part of the picture that is drawn, as horizontal places from -1 to 1
-  drawFace(name, state, { uniforms, glow, sums, mirror, span }) {
+  drawFace(name, state, { uniforms, glow, sums, mirror, span, coarse }) {
     const gl = this.gl, { width, height } = this.canvas, { face } = this;
     const { through } = state, eye = through ? through.eye : state.eye || add(face.centre, direction(state.azimuth, state.elevation), state.distance);
     const reach = Math.hypot(...sub(eye, face.centre));
@@ -308,7 +325,7 @@ class Painter {
       [gl.TEXTURE_2D, glow], [gl.TEXTURE_2D, this.mirror], [gl.TEXTURE_2D, this.lobes],
       [gl.TEXTURE_2D, this.detail],
     ]);
-    const program = state.component ? "components" : face.tableB ? "faceOfMany" : "face";
+    const program = state.component ? "components" : (coarse ? "coarse" : "face") + (face.tableB ? "OfMany" : "");
     setUniforms(gl, this.programs[program], {
       ...uniforms, matrix: ["mat4", matrix], eye: ["3fv", eye], exposure: ["1f", state.exposure * face.exposure],
       tableA: ["1i", 1], tableB: ["1i", 2], glow: ["1i", 3], mirror: ["1i", 4], lobes: ["1i", 5], detail: ["1i", 6], withDetail: ["1i", face.detail ? 1 : 0],
@@ -318,18 +335,19 @@ class Painter {
     });
     const side = this.sides[name];
     gl.bindVertexArray(side.vao);
-    this.selectVisible(side, eye, matrix, span);
+    this.selectVisible(side, eye, matrix, span, coarse);
     gl.drawElements(gl.TRIANGLES, side.size, gl.UNSIGNED_INT, 0);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, side.index);
     gl.bindVertexArray(null);
   }
 
   // binds the list of the triangles of a side that the view shows
-  selectVisible(side, eye, matrix, span) {
-    const gl = this.gl, asked = [...matrix, ...span].join();
+  selectVisible(side, eye, matrix, span, coarse) {
+    const gl = this.gl, asked = [...matrix, ...span, coarse].join(), which = coarse ? 1 : 0;
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, side.list);
     if (side.seen === asked) return;
-    const list = side.visible.select(eye, matrix, ...span);
+    side.visible[which] = side.visible[which] || new VisibleTriangles({ ...this[coarse ? "coarse" : "visible"], position: side.values.position });
+    const list = side.visible[which].select(eye, matrix, ...span);
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, list, gl.DYNAMIC_DRAW);
     Object.assign(side, { seen: asked, size: list.length });
   }

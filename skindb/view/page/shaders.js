@@ -246,6 +246,25 @@ vec3 place(vec3 n, vec3 wi, vec3 wo) {
 
 ${DETAIL}
 ${ENCODE}
+// adds the reflection of one light
+void reflected(int i, vec3 n, vec3 wo, float leaves, inout vec3 matte, inout vec3 gloss) {
+  vec3 way = lightPosition[i] - vPosition;
+  float square = dot(way, way);
+  vec3 wi = way * inversesqrt(square);
+  float cosI = dot(wi, n);
+  if (cosI <= 0.0) return;
+  float visible = lit(i, vPosition, n);
+  if (visible == 0.0) return;
+  vec3 received = lightIntensity[i] * (cosI / square * visible);
+  if (!withGlow) matte += received * (transmittance(min(cosI, 1.0)) * leaves / PI);
+  if (!withSurface) return;
+  vec3 at = place(n, wi, wo);
+  float sum = dot(vWeightA, texture(tableA, at));
+#ifdef SECOND_TABLE
+  sum += dot(vWeightB, texture(tableB, at));
+#endif
+  gloss += received * sum;
+}
 void main() {
   vec3 n = finerNormal(vNormal);
   vec3 wo = normalize(eye - vPosition), matte = vec3(0.0), gloss = vec3(0.0);
@@ -253,26 +272,13 @@ void main() {
   if (cosO < MIN_COSINE) n = normalize(n + (MIN_COSINE - cosO) * wo);  // no black line where shading normals turn away
   cosO = clamp(cosO, MIN_COSINE, 1.0);
   float leaves = transmittance(cosO);
-  for (int i = 0; i < lightCount; i++) {
-    vec3 way = lightPosition[i] - vPosition;
-    float square = dot(way, way);
-    vec3 wi = way * inversesqrt(square);
-    float cosI = dot(wi, n);
-    if (cosI <= 0.0) continue;
-    float visible = lit(i, vPosition, n);
-    if (visible == 0.0) continue;
-    vec3 received = lightIntensity[i] * (cosI / square * visible);
-    if (!withGlow) matte += received * (transmittance(min(cosI, 1.0)) * leaves / PI);
-    if (withSurface) {
-      vec3 at = place(n, wi, wo);
-      float sum = dot(vWeightA, texture(tableA, at));
-#ifdef SECOND_TABLE
-      sum += dot(vWeightB, texture(tableB, at));
+  // not a loop, which takes more time without a graphics card
+  ${[...Array(MAX_LIGHTS).keys()].map((i) => `if (${i} < lightCount) reflected(${i}, n, wo, leaves, matte, gloss);`).join("\n  ")}
+  vec4 under = withGlow ? texture(glow, vUv) : vec4(vAmbient.rgb, 1.0);
+#ifdef COARSE
+  under /= max(under.a, 0.01);  // large texels at the border are partly empty
 #endif
-      gloss += received * sum;
-    }
-  }
-  matte = withGlow ? texture(glow, vUv).rgb * (leaves / PI) : matte + vAmbient.rgb * (leaves / PI);
+  matte += under.rgb * (leaves / PI);
   if (withSurface && withMirror) {
     vec3 way = reflect(-wo, n);
     float albedo = dot(vWeightA, texture(lobes, vec2(cosO, 0.25)));

@@ -4,7 +4,7 @@
 class VisibleTriangles {
   constructor({ position, triangles }) {
     const count = triangles.length / 3;
-    Object.assign(this, { position, triangles, planes: new Float32Array(4 * count), chosen: new Uint32Array(triangles.length) });
+    Object.assign(this, { position, triangles, planes: new Float32Array(4 * count), chosen: new Uint32Array(triangles.length), corners: Uint32Array.from(new Set(triangles)) });
     this.across = new Float32Array(position.length / 3);  // horizontal place in the picture, from -1 to 1
     const { planes } = this;
     for (let i = 0; i < count; i++) {
@@ -25,8 +25,8 @@ class VisibleTriangles {
   select(eye, matrix, from, to) {
     const { position, triangles, planes, chosen, across } = this;
     const [x, y, z] = eye, tolerance = 2e-2 * Math.hypot(x, y, z);
-    for (let i = 0, k = 0; i < across.length; i++, k += 3) {
-      const a = position[k], b = position[k + 1], c = position[k + 2];
+    for (const i of this.corners) {
+      const k = 3 * i, a = position[k], b = position[k + 1], c = position[k + 2];
       const w = matrix[3] * a + matrix[7] * b + matrix[11] * c + matrix[15];
       across[i] = w > 0 ? (matrix[0] * a + matrix[4] * b + matrix[8] * c + matrix[12]) / w : NaN;  // NaN keeps triangles
     }
@@ -42,4 +42,29 @@ class VisibleTriangles {
     }
     return chosen.subarray(0, size);
   }
+}
+
+// Triangles between fewer vertices, about `length` mm apart: one for each cell of the texture, and those of the border.
+function fewerTriangles({ triangles, uv, spacing }, length) {
+  const count = spacing.length, cells = Math.ceil(Float32Array.from(spacing).sort()[count >> 1] / length);
+  const sides = new Map(), cell = new Map(), chosen = new Int32Array(count).fill(-1), out = [];
+  for (let i = 0; i < triangles.length; i++) {
+    const a = triangles[i], b = triangles[i % 3 === 2 ? i - 2 : i + 1], side = Math.min(a, b) * count + Math.max(a, b);
+    if (!sides.delete(side)) sides.set(side, [a, b]);
+  }
+  for (const [a, b] of sides.values()) {
+    chosen[a] = a;
+    chosen[b] = b;
+  }
+  for (let i = 0; i < count; i++) {
+    const at = Math.floor(uv[2 * i] * cells) * (cells + 1) + Math.floor(uv[2 * i + 1] * cells);
+    if (chosen[i] >= 0) continue;
+    if (!cell.has(at)) cell.set(at, i);
+    chosen[i] = cell.get(at);
+  }
+  for (let i = 0; i < triangles.length; i += 3) {
+    const [a, b, c] = [chosen[triangles[i]], chosen[triangles[i + 1]], chosen[triangles[i + 2]]];
+    if (a !== b && b !== c && c !== a) out.push(a, b, c);
+  }
+  return Uint32Array.from(out);
 }
