@@ -337,20 +337,12 @@ def require_complete(run: DomeRun, cameras: Sequence[str]) -> None:
         "keep the subject or target in place and run the capture again; it resumes with the "
         "missing steps"
     )
-    faults = (
-        [Fault("capture", "must run to its end", run.stopped, cure)]
-        if run.stopped
-        else []
-    )
-    if lost := run.missing(cameras):
-        faults.append(
-            Fault(
-                "capture",
-                "every step must have a frame of every camera",
-                _describe_missing(run, lost),
-                cure,
-            )
-        )
+    faults = list[Fault]()
+    if run.stopped:
+        faults.append(Fault("capture", "must run to its end", run.stopped, cure))
+    elif lost := run.missing(cameras):
+        rule = "every step must have a frame of every camera"
+        faults.append(Fault("capture", rule, _describe_missing(run, lost), cure))
     for light, failure in run.faulty_lights.items():
         rule = (
             "all lights must be off"
@@ -373,9 +365,8 @@ def _describe_missing(run: DomeRun, lost: Mapping[int, Sequence[str]]) -> str:
         for i, cameras in lost.items()
         for camera in cameras
     ]
-    # of a run that was stopped, the last markers are missing as well
-    problems = [] if run.stopped else run.problems
-    reasons = f" ({few_names(problems, separator='; ')})" if problems else ""
+    reasons = few_names(run.problems, separator="; ")
+    reasons = f" ({reasons})" if reasons else ""
     return f"{len(names)} missing frames: {few_names(names, 5, '; ')}{reasons}"
 
 
