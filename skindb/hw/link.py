@@ -7,7 +7,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import chain, count
 from pathlib import Path
@@ -256,7 +256,7 @@ class Link:
 
     A request is repeated with the same number if no reply arrives in time; the device answers a
     repeated number without executing the request again. Every call ends within
-    `ATTEMPTS * REPLY_SECONDS`.
+    `ATTEMPTS * REPLY_SECONDS`, twice that if the port accepts no bytes.
 
     Parameters
     ----------
@@ -454,7 +454,10 @@ class Link:
 
     def _write(self, data: bytes) -> None:
         try:
-            self._port.write(data)
+            # pyserial also reports a timeout if this process was suspended after it had
+            # sent the line; if it was not sent, there is no reply, and it is sent again
+            with suppress(serial.SerialTimeoutException):
+                self._port.write(data)
         except OSError as error:
             raise self.error("must stay connected", f"{error}") from None
         self._note(">", data)

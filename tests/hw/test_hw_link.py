@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import serial
 from devices_pair import (
     EXPOSURES,
     LIGHTS,
@@ -47,7 +48,7 @@ from skindb.hw.link import (
 from skindb.hw.probe import Probe
 from skindb.hw.sequence import plan_schedule
 from skindb.hw.session import require_complete
-from skindb.virtual.devices import DeviceFaults, EmulatedDome
+from skindb.virtual.devices import DeviceFaults, DirectPort, EmulatedDome
 from skindb.virtual.laboratory import LaboratoryFaults
 
 NAMES = st.text("abcxyz_", min_size=1, max_size=8)
@@ -269,6 +270,25 @@ def test_request__loop_answers_nothing():
     ):
         Dome(link)
     link.close()
+
+
+@pytest.mark.parametrize("is_sent", [True, False])
+def test_request__a_write_that_ended_late_is_no_lost_device(is_sent):
+    """A process that was suspended finds a timeout, although the line may have been sent."""
+
+    class Late(DirectPort):
+        is_late = True
+
+        def write(self, data):
+            if is_sent or not self.is_late:
+                super().write(data)
+            if self.is_late:
+                self.is_late = False
+                raise serial.SerialTimeoutException("Write timeout")
+
+    clock = SimulatedClock()
+    device = EmulatedDome(tuple(LIGHTS), lambda *_: None, clock=clock)
+    assert Dome(Link(Late(device, clock), "dome", clock=clock)).lights
 
 
 @pytest.mark.parametrize(
