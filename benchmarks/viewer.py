@@ -13,6 +13,31 @@ from playwright.sync_api import sync_playwright
 
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 ROUNDS = 15
+SECONDS = 4  # of each gesture, after as many in which the page chooses how many pixels it draws
+# gestures of a user, one at each frame that the browser shows, until the time is over
+GESTURES = """async () => {
+    const {canvas} = skindb.painter(), found = {};
+    const key = (shiftKey) => (i) => canvas.dispatchEvent(
+        new KeyboardEvent("keydown", {key: i % 2 ? "ArrowLeft" : "ArrowRight", shiftKey}));
+    const slide = (input) => (i) => {
+        input.value = Number(input.min) + (0.5 + 0.01 * (i % 9)) * (input.max - input.min);
+        input.dispatchEvent(new Event("input"));
+    };
+    const gestures = {turn: key(false), light: key(true)};
+    const sliders = "#environment [type=range], #traits [type=range]";
+    for (const input of document.querySelectorAll(sliders))
+        gestures[`slider of ${input.ariaLabel}`] = slide(input);
+    for (const [name, act] of Object.entries(gestures)) {
+        let shown = 0, i = 0, start = performance.now();
+        const end = start + 2000 * SECONDS, half = start + 1000 * SECONDS;
+        for (let now = start; now < end; now = await new Promise(requestAnimationFrame)) {
+            act(i++);
+            if (now > half) shown++;
+        }
+        found[name] = [shown / SECONDS, canvas.width, canvas.height];
+    }
+    return [found, canvas.clientWidth, canvas.clientHeight];
+}""".replace("SECONDS", str(SECONDS))
 # frames of the gestures take turns, so that other load slows all of them down alike
 MEASURE = """async () => {
     const {state, painter} = skindb, {gl, canvas, face} = painter();
@@ -51,7 +76,9 @@ MEASURE = """async () => {
 
 
 def main(page: Path) -> None:
-    """Print the median time of a frame of each gesture, and its ratio to that of a turn."""
+    """Print what a user sees of each gesture, then the median time of a frame at two sizes,
+    and its ratio to that of a turn.
+    """
     print(f"{page.stat().st_size / 1e6:.1f} MB")
     with sync_playwright() as running:
         browser = running.chromium.launch(
@@ -63,8 +90,14 @@ def main(page: Path) -> None:
         tab.set_default_timeout(0)
         tab.goto(page.resolve().as_uri())
         tab.evaluate("skindb.ready")
+        shown, *size = tab.evaluate(GESTURES)
         times = tab.evaluate(MEASURE)
         browser.close()
+    for name, (rate, *pixels) in shown.items():
+        print(
+            f"{size[0]} x {size[1]}, {name}: {rate:.1f} frames per second, drawn with "
+            f"{pixels[0]} x {pixels[1]} pixels"
+        )
     for name, samples in times.items():
         gesture, _, fraction = name.rpartition(" ")
         size = (

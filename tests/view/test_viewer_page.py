@@ -591,6 +591,32 @@ def test_page__draws_fewer_pixels_only_while_something_moves(browser, page_file)
 
 
 @pytest.mark.slow
+def test_page__frames_that_take_longer_than_a_rest_have_fewer_pixels(
+    browser, page_file
+):
+    """Otherwise each of them ends the movement, and a whole picture is drawn after it."""
+    page = opened(browser, page_file.as_uri())
+    width, shown = page.evaluate(
+        """async () => {
+            const painter = skindb.painter(), {canvas} = painter, {draw} = painter;
+            skindb.stop();
+            painter.draw = function (...given) {
+                const end = performance.now() + 400;
+                while (performance.now() < end);
+                return draw.apply(this, given);
+            };
+            for (let press = 0; press < 50 && canvas.width > 0.26 * canvas.clientWidth; press++) {
+                canvas.dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowLeft'}));
+                await new Promise(requestAnimationFrame);
+            }
+            return [canvas.width, canvas.clientWidth];
+        }"""
+    )
+    assert width <= 0.26 * shown
+    page.close()
+
+
+@pytest.mark.slow
 def test_page__a_lost_context_is_restored(browser, page_file):
     page = opened(browser, page_file.as_uri())
     page.get_by_label("tan").fill("1")  # an edit survives, too

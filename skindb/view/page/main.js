@@ -13,42 +13,48 @@ const COMPONENTS = {
 const BACKGROUNDS = { studio: null, black: [0, 0, 0], grey: [0.47, 0.47, 0.47], white: [1, 1, 1] };  // studio is that of the style
 const PRESETS = [[-18, 38, 0.85], [150, 25, 1.2], [-60, 10, 0.5], [-20, 70, 0.5]];  // azimuth, elevation and power of a key, a rim and other lights
 const REST_MS = 300;  // a movement has ended after this time without another change
-const SLOW_MS = 66, FAST_MS = 25;  // between frames, beyond which fewer or more pixels are drawn while something moves
+const SLOW_MS = 66, FAST_MS = 25;  // of a frame, beyond which fewer or more pixels are drawn while something moves
 const TURN = { angle: 30, seconds: 16 };
 const state = {
   azimuth: TURN.angle, elevation: 4, distance: 700, tangent: 0.2, exposure: 1, softness: 1.5, divider: 1, component: 0, toned: true,
   withDiffuse: true, withSurface: true, glow: true, background: BACKGROUNDS.studio, lights: [], around: { on: true, turn: 0, power: 0.35 },
 };
 let painter = null, face = null, amounts = [], active = 0, pending = false, moving = null, turning = null;
-const speed = { fraction: 1, last: 0 };  // of the pixels along a side, while something moves
+const speed = { fraction: 1, most: 1 };  // of the pixels along a side, while something moves
 
 function say(text) { $("status").textContent = text; }
 
 function redraw() {
   if (pending || !painter) return;
   pending = true;
-  requestAnimationFrame((now) => {
+  requestAnimationFrame(() => {
+    const isMoving = moving !== null, begin = performance.now();
     pending = false;
-    adapt(now);
     resize();
-    if (painter.draw(state, moving !== null) < 1) redraw();
+    if (painter.draw(state, isMoving) < 1) redraw();
+    if (isMoving) {
+      painter.finish();
+      adapt(performance.now() - begin);
+      waitForRest();  // a slow frame is no rest
+    }
     placePhotograph();
   });
 }
 
 // Draws fewer pixels while something moves if frames take too long, and at once without a graphics card.
-function adapt(now) {
-  const since = now - speed.last, most = painter.software ? 0.5 : 1;
-  speed.last = moving === null ? 0 : now;
-  if (moving === null || since > REST_MS) speed.fraction = Math.min(speed.fraction, most);
-  else if (since > SLOW_MS) speed.fraction = Math.max(0.8 * speed.fraction, 0.25);
-  else if (since < FAST_MS) speed.fraction = Math.min(1.1 * speed.fraction, most);
+function adapt(took) {
+  const factor = took > SLOW_MS ? 0.8 : took < FAST_MS ? 1.1 : 1;
+  speed.fraction = Math.min(Math.max(factor * speed.fraction, 0.25), speed.most);
+}
+
+function waitForRest() {
+  clearTimeout(moving);
+  moving = setTimeout(() => { moving = null; redraw(); }, REST_MS);
 }
 
 // for drawing while something moves
 function redrawMoving() {
-  clearTimeout(moving);
-  moving = setTimeout(() => { moving = null; redraw(); }, REST_MS);
+  waitForRest();
   redraw();
 }
 
@@ -367,6 +373,7 @@ async function start() {
   if (new URLSearchParams(location.search).has("no-webgl")) return noPicture("WebGL is switched off.");
   try {
     painter = new Painter($("canvas"));
+    speed.most = speed.fraction = painter.software ? 0.5 : 1;
   } catch (error) {
     return noPicture(error.message);
   }

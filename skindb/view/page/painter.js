@@ -98,6 +98,9 @@ class Painter {
 
   isMoved() { return this.sides.edited && this.sides.edited.values.position !== this.face.position; }
 
+  // Waits until what was drawn is finished.
+  finish() { this.gl.readPixels(0, 0, 1, 1, this.gl.RGBA, this.gl.UNSIGNED_BYTE, new Uint8Array(4)); }
+
   // Draws a picture, or the next part of a picture in an environment; returns the fraction that is done. With
   // `coarse`, while something moves, the environment has a smooth reflection and, without a graphics card, the face has
   // fewer vertices, and light under the skin fewer texels.
