@@ -93,16 +93,18 @@ def render(
     if written.suffix:
         require_one_take(written, chosen)
     request["edited"] = edited
+    progress = bar()
     call = partial(
         workflow.render_take,
         database,
         shared_path(written),
+        progress=progress,
         **request,
         **vars(parameters),
     )
     finish = partial(_rendered, explain=request["explain"], error=parameters.error)
     with workflow.logged_action(database, "render", chosen, arguments=request):
-        results, faults = each_take(call, chosen, progress=bar(), finish=finish)
+        results, faults = each_take(call, chosen, progress=progress, finish=finish)
     emit(results, [], faults)
 
 

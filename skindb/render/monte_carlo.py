@@ -32,7 +32,7 @@ from skindb.render.subsurface import (
     received_irradiance,
     subsurface_light,
 )
-from skindb.types import Array, Index, Mask, Progress, dots, float64, lengths
+from skindb.types import Array, Index, Mask, Progress, dots, float64, lengths, silent
 
 # rays per pixel and axis in one batch; random numbers are stratified over the rays of a
 # pixel. Environments need more
@@ -87,7 +87,7 @@ def render_monte_carlo(
     rng: np.random.Generator,
     scene: RayScene | None = None,
     pixels: Mask | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Rendering:
     """Render a surface as the mean of independent batches of rays.
 
@@ -106,8 +106,8 @@ def render_monte_carlo(
     pixels
         (h, w) pixels that may show the surface; default all.
     progress
-        Called after every batch with the stage, the rays per pixel done, and the rays
-        per pixel in all.
+        Called after every pass of light under the skin and every batch of rays with the
+        stage, and the passes, or rays per pixel, that are done and that there are at most.
 
     Returns
     -------
@@ -121,7 +121,7 @@ def render_monte_carlo(
         view = trace_view(
             surface, camera, samples=RAYS_PER_AXIS, scene=rays, pixels=pixels
         )
-        painter, sums.more = painter.with_subsurface_light(view, rng)
+        painter, sums.more = painter.with_subsurface_light(view, rng, progress)
     axis = RAYS_PER_AXIS
     enough = quality.samples >= 2 * RAYS_PER_AXIS_ENVIRONMENT**2
     if lighting.environment is not None and enough:
@@ -138,8 +138,7 @@ def render_monte_carlo(
             surface, camera, samples=axis, scene=rays, rng=rng, pixels=pixels
         )
         sums.add(painter.batch(view, rng), view.coverage)
-        if progress is not None:
-            progress("render", min(sums.count * per_batch, limit), limit)
+        progress("render", min(sums.count * per_batch, limit), limit)
     return Rendering(
         np.asarray(sums.mean, np.float32),
         np.asarray(sums.variance(), np.float32),
@@ -194,7 +193,7 @@ class _Painter:
         return cls(surface, scene, lighting, quality, lobes, weights, choice, bounced)
 
     def with_subsurface_light(
-        self, view: View, rng: np.random.Generator
+        self, view: View, rng: np.random.Generator, progress: Progress
     ) -> tuple[_Painter, Image]:
         """A painter with subsurface light where the view shows the surface, and the variance
         (h, w, 3) that it adds to the picture.
@@ -212,6 +211,7 @@ class _Painter:
             count=count,
             error=np.inf if error is None else error / 2,
             rng=rng,
+            progress=progress,
         )
         if self.exitance is not None:
             light = light + self.exitance

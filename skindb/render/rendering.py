@@ -46,7 +46,7 @@ from skindb.render.views import (
     turntable_azimuths,
 )
 from skindb.schema.consent import honour_consent
-from skindb.types import Bytes, Float32, Progress, dots, lengths
+from skindb.types import Bytes, Float32, Progress, dots, lengths, silent
 
 UNITS = "radiance"  # in the unit of the photographs, or of the environment
 NO_LIGHTS = Lights(
@@ -112,7 +112,7 @@ def render(
     terms: Sequence[str] = ("diffuse", "surface"),
     scale: float = 1.0,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> xr.Dataset:
     """Render a model under lights of its dome, other lights or an environment (Weyrich
     et al. 2005, eq. 1-4, 8, 9).
@@ -146,7 +146,7 @@ def render(
     seed
         Random seed.
     progress
-        Called with the stage, the rays per pixel done, and the rays per pixel in all.
+        See `skindb.render.monte_carlo.render_monte_carlo`.
 
     Returns
     -------
@@ -272,7 +272,12 @@ def _chosen_lighting(
 
 
 def render_picture(
-    model: xr.DataTree, out: Path, *, explain: bool = False, **options: Any
+    model: xr.DataTree,
+    out: Path,
+    *,
+    explain: bool = False,
+    progress: Progress = silent,
+    **options: Any,
 ) -> dict[str, Any]:
     """Render a model and write it as linear EXR or tone-mapped PNG, depending on the
     suffix of `out`.
@@ -286,6 +291,8 @@ def render_picture(
         variance.G, variance.B. A WebP is animated: the view swings around the face.
     explain
         Only plan the picture and write nothing.
+    progress
+        As in `render`.
     **options
         Of `skindb.parameters.RenderParameters`: lights, environment, camera, samples,
         error, seed, subsurface and bounces as in `render`; view and light_from, a camera and a
@@ -326,7 +333,7 @@ def render_picture(
         return {"path": str(out), **inputs.names, "skipped": skipped, "kept": KEPT}
     names = ("samples", "error", "subsurface", "bounces", "seed")
     settings = {name: getattr(parameters, name) for name in names}
-    frames = [render(model, **shot, **settings) for shot in shots]
+    frames = [render(model, **shot, **settings, progress=progress) for shot in shots]
     seen = frames[0]
     summary = {"path": str(out)} | {
         key: value for key, value in seen.attrs.items() if key != "seconds"

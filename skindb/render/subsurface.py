@@ -24,7 +24,17 @@ from skindb.render.scene import (
     subdivide_surface,
 )
 from skindb.render.shading import points_on_discs, received_light, trace_view
-from skindb.types import Array, Float32, Mask, dots, finite_rows, lengths, unit
+from skindb.types import (
+    Array,
+    Float32,
+    Mask,
+    Progress,
+    dots,
+    finite_rows,
+    lengths,
+    silent,
+    unit,
+)
 
 Image = Float32
 FAR = 1e5  # mm, length of shadow rays towards an environment
@@ -91,6 +101,7 @@ def subsurface_light(
     count: int,
     error: float = np.inf,
     rng: np.random.Generator,
+    progress: Progress = silent,
 ) -> tuple[Array, Array]:
     """Radiant exitance (v, 3) under the boundary and its standard error, as the mean of
     independent passes; vertices that are no receivers (v,) have that of the nearest one.
@@ -105,6 +116,8 @@ def subsurface_light(
     ):
         light = _light_of_pass(surface, lighting, scene, receivers, tolerance, rng)
         passes.add(light, receivers.astype(float))
+        most = count if error == np.inf else MAX_PASSES
+        progress("light under the skin", passes.count, most)
     reached = np.flatnonzero(receivers)
     if not len(reached):
         return passes.mean, passes.mean

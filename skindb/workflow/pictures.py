@@ -68,6 +68,7 @@ def render_take(
     edited: bool = False,
     generation: int | None = None,
     explain: bool = False,
+    progress: Progress = silent,
     **options: Any,
 ) -> Json:
     """Render the model of a take to a picture.
@@ -86,6 +87,8 @@ def render_take(
         Version of the model; default the newest.
     explain
         Only plan the picture.
+    progress
+        As in `skindb.render.render`.
     **options
         Of `skindb.parameters.RenderParameters`, see `skindb.render.render_picture`.
     """
@@ -94,7 +97,8 @@ def render_take(
     path = out if out.suffix else out / f"{take}.png"
     if not explain:
         make_private(path.parent)
-    return {"take": take} | render_picture(model, path, explain=explain, **options)
+    picture = render_picture(model, path, explain=explain, progress=progress, **options)
+    return {"take": take} | picture
 
 
 @logged("compare")

@@ -300,6 +300,22 @@ def test_render_picture__exposure_is_that_of_a_white_surface(
     assert level["fixed", "plain"][1] == pytest.approx(expected, rel=1e-6)
 
 
+def test_render_picture__reports_passes_and_rays(
+    model: xr.DataTree, tmp_path: Path
+) -> None:
+    calls = list[tuple[str, int, int]]()
+    render_picture(
+        model,
+        tmp_path / "a.png",
+        samples=8,
+        subsurface=True,
+        error=None,
+        progress=lambda *call: calls.append(call),
+    )
+    light = [("light under the skin", i + 1, 8) for i in range(8)]
+    assert calls == [*light, ("render", 4, 8), ("render", 8, 8)]
+
+
 def test_render_picture__exposure_counts_lights_that_are_skipped(
     model: xr.DataTree, tmp_path: Path
 ) -> None:
