@@ -65,7 +65,9 @@ class SimulatedClock:
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
     """Context at whose end Ctrl-C takes effect: devices do not stop in the midst of an act."""
-    if threading.current_thread() is not threading.main_thread():
+    is_main = threading.current_thread() is threading.main_thread()
+    # None is a handler of another library, which cannot be set again
+    if not is_main or signal.getsignal(signal.SIGINT) is None:
         yield
         return
     pressed = list[int]()
