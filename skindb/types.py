@@ -45,7 +45,6 @@ ByteVector = Rank1[np.uint8]
 ByteMatrix = Rank2[np.uint8]
 
 Real = float | np.floating[Any]
-Integer = int | np.integer[Any]
 
 MIN_LENGTH = 1e-12  # of a vector that has a direction; shorter ones are rounding
 
