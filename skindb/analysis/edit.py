@@ -499,8 +499,8 @@ def describe_edit(report: Mapping[str, Report]) -> list[str]:
             lines.append(f"{part}: {limited} {clipped:.1%} of the area")
     if albedo.get("how") == "colours":
         lines.append(
-            "albedo: only colours were edited; textures need a registration of the "
-            "take and of the study"
+            "albedo: only colours were edited; textures need registrations by this "
+            "version of skindb: skindb register DB, then skindb analyze DB traits"
         )
     if albedo.get("distance") is not None:
         lines.append(
