@@ -78,5 +78,5 @@ def main(spectra: Path) -> None:
     for index in INDICES:
         lobes = np.array([[1.0, alpha] for alpha in ROUGHNESS])
         smooth = float(fresnel_reflectance(1.0, index))
-        values = [smooth, *GGX(index).normal_reflectance(lobes)]
+        values = [smooth, *GGX(index).normal_reflectance(lobes)[0]]
         print(f"| {index} | {' | '.join(f'{value:.3f}' for value in values)} |")

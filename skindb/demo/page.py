@@ -87,7 +87,7 @@ def _maps(model: xr.DataTree) -> list[tuple[Picture, Mask, str]]:
     surface = from_model(model)
     camera, _ = chosen_camera(model["dome"].dataset.load(), None)
     view = trace_view(surface, camera.scaled(1.2), samples=2)
-    shine = surface.model.normal_reflectance(view.interpolate(surface.parameters))
+    shine, _ = surface.model.normal_reflectance(view.interpolate(surface.parameters))
     pictures = [
         ((view.interpolate(surface.normals) + 1) / 2, "normal"),
         (encode_srgb(view.interpolate(surface.diffuse)), "diffuse albedo"),

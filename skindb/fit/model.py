@@ -34,6 +34,7 @@ from skindb.fit.surface import fit_surface, refit_and_evaluate
 from skindb.fit.translucency import fit_probe, summarise_translucency, translucency_map
 from skindb.jit import reported_compilation
 from skindb.parameters import FitParameters
+from skindb.reflectance.block import gloss_of
 from skindb.reflectance.dictionary import Dictionary
 from skindb.reflectance.joint import Gloss
 from skindb.reflectance.kinds import surface_model
@@ -256,7 +257,11 @@ def second_pass(
             mode=parameters.mode,
             eta=parameters.eta,
         )
-    groups = _groups(capture, fitted.assign(judged), basis, gains)
+    # a basis of four does not contain what few surfels reflect: noses would lose a sixth
+    gloss = gloss_of(surface.normal_reflectance(surface.parameters_of(fitted)))
+    groups = _groups(
+        capture, fitted.assign(judged).assign(dataset(gloss)), basis, gains
+    )
     prior = None
     if not relative_reflectance(samples):
         condition = str(capture.attrs.get("condition", "normal"))

@@ -101,6 +101,15 @@ def empty_fit(
     )
 
 
+def gloss_of(reflectance: Array) -> dict[str, Array]:
+    """Surface reflectance and glossiness of n surfels from `normal_reflectance` (2, n)."""
+    whole, narrow = reflectance
+    return {
+        variables.SURFACE_REFLECTANCE: whole,
+        variables.GLOSSINESS: narrow / np.where(whole > 0, whole, np.nan),
+    }
+
+
 def gloss_columns(
     judged: SurfaceFit, reflectance: Array, gradient: Array
 ) -> dict[str, Array]:
@@ -116,8 +125,8 @@ def gloss_columns(
     gradient
         (2, n or 1, m) derivatives by the parameters.
     """
-    whole, narrow = reflectance
-    glossiness = narrow / np.where(whole > 0, whole, np.nan)
+    gloss = gloss_of(reflectance)
+    whole, glossiness = gloss.values()
     by_whole, by_narrow = gradient
     by_narrow = by_narrow - glossiness[:, None] * by_whole
     covariance = np.nan_to_num(judged.covariance)
@@ -129,9 +138,8 @@ def gloss_columns(
     )
     deviation = np.sqrt(np.where(variance > ROUNDING**2, variance, np.nan))
     return {
-        variables.SURFACE_REFLECTANCE: whole,
+        **gloss,
         variables.SURFACE_REFLECTANCE_ERROR: deviation[0],
-        variables.GLOSSINESS: glossiness,
         variables.GLOSSINESS_ERROR: deviation[1] / whole,
     }
 

@@ -216,10 +216,10 @@ class GGX(ReflectanceModel):
         return np.asarray(out + gloss[:, None], np.float32)
 
     def normal_reflectance(self, parameters: Array) -> Array:
-        """Fraction (n,) of light along the normal that the lobes reflect."""
+        """Fractions (2, n) of light along the normal that the lobes reflect."""
         nodes, albedo = _normal_albedo(self.index)
-        fraction = np.interp(parameters[:, ROUGHNESS], nodes, albedo[0])
-        return parameters[:, STRENGTH] * fraction
+        strength, roughness = parameters.T
+        return strength * np.stack([np.interp(roughness, nodes, row) for row in albedo])
 
     def resample(self, parameters: Array) -> tuple[Table, Array]:
         """Tables of lobes at `TABLES` roughnesses, and weights (n, TABLES) that interpolate

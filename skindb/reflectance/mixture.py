@@ -176,13 +176,12 @@ class Mixture:
 
     @cached_property
     def normal_albedo(self) -> Array:
-        """Fraction (r,) of light along the normal that each table reflects."""
-        return directional_albedo(self.table, 1.0)[0]
-
-    @cached_property
-    def narrow_albedo(self) -> Array:
-        """The part (r,) of `normal_albedo` within `NARROW_ANGLE`."""
-        return np.asarray(directional_albedo(self.table, 1.0, NARROW_ANGLE)[0])
+        """Fractions (2, m) of light along the normal that each BRDF reflects: all of it, and
+        that within `NARROW_ANGLE`.
+        """
+        angles = (np.pi / 2, NARROW_ANGLE)
+        albedo = [directional_albedo(self.table, 1.0, angle)[0] for angle in angles]
+        return np.stack(albedo) @ self.matrix
 
     @cached_property
     def half_width(self) -> Float64:
@@ -290,12 +289,12 @@ class Mixture:
         glossiness with their errors, which are NaN if no weight is above 0 or weights
         cannot be distinguished.
         """
-        albedo = np.stack([self.normal_albedo, self.narrow_albedo])[:, None]
+        reflected = self.normal_reflectance(judged.parameters)
         deviation = np.sqrt(np.diagonal(judged.covariance, axis1=1, axis2=2))
         return {
             variables.BASIS_WEIGHT: judged.parameters,
             variables.BASIS_WEIGHT_ERROR: deviation,
-            **gloss_columns(judged, (albedo * judged.parameters).sum(axis=-1), albedo),
+            **gloss_columns(judged, reflected, self.normal_albedo[:, None]),
         }
 
     def shade(self, points: Points, lamp: Lamp, *, eta: float) -> Float32:
@@ -313,8 +312,8 @@ class Mixture:
         return shade_tables(points, table, lamp, eta=eta)
 
     def normal_reflectance(self, parameters: Array) -> Array:
-        """Fraction (n,) of light along the normal that mixtures (n, m) reflect."""
-        return parameters @ self.normal_albedo
+        """Fractions (2, n) of light along the normal that mixtures (n, m) reflect."""
+        return self.normal_albedo @ parameters.T
 
     def simplified(
         self, parameters: Array

@@ -214,7 +214,9 @@ class ReflectanceModel(Protocol):
         """
 
     def normal_reflectance(self, parameters: Array) -> Array:
-        """Fraction (n,) of light along the normal that the surface reflects."""
+        """Fractions (2, n) of light along the normal that the surface reflects: all of it,
+        and that in the narrow of two lobes.
+        """
 
     def simplified(
         self, parameters: Array

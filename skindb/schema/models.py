@@ -115,7 +115,8 @@ LOBE_ROUGHNESS_ERROR = declare(
 )
 SURFACE_REFLECTANCE = declare(
     "float32 fitted/surface_reflectance(surfel) [1]",
-    "fraction of light along the normal that the surface reflects, by its fitted model",
+    "fraction of light along the normal that the surface reflects, by the mixture of all "
+    "BRDFs or by its lobe",
     uses=Use.SAMPLED | Use.MAPPED,
 )
 SURFACE_REFLECTANCE_ERROR = declare(

@@ -32,6 +32,7 @@ from skindb.fit.lumitexels import lumitexels as lumitexels_of
 from skindb.fit.plan import fitted_part, hold_out, plan_fit
 from skindb.fit.quality import HELD_OUT_ERRORS, error_of_misfit
 from skindb.optics.diffusion import sigma_tr
+from skindb.reflectance.block import gloss_of
 from skindb.reflectance.mixture import Mixture
 from skindb.render.scene import from_model
 from skindb.schema import GROUPS, FitStatus, check, dataset, label
@@ -218,16 +219,14 @@ def test_fit_model__passes_are_their_separate_methods(
     alone = estimate_normals(work)
     alone = alone.merge(estimate_diffuse_reflectance(work.merge(alone)))
     alone = alone.assign(refine_jointly(work.merge(alone)))
-    alone = alone.merge(
-        fit_surface(
-            work.merge(alone),
-            surface=Mixture.of_dictionary(_averaged(small_dictionary, whole), rank=6),
-        )
-    )
+    surface = Mixture.of_dictionary(_averaged(small_dictionary, whole), rank=6)
+    alone = alone.merge(fit_surface(work.merge(alone), surface=surface))
     total = alone["diffuse_reflectance_total_error"]
     total[:] = np.hypot(total.values, error_of_misfit(alone))
     basis = model["basis"].to_dataset()
     alone = alone.merge(refit(work.merge(alone), basis=basis))
+    gloss = gloss_of(surface.normal_reflectance(surface.parameters_of(alone)))
+    alone = alone.assign(dataset(gloss))
     known = alone[["shading_normal", "diffuse_reflectance", "basis_weight"]]
     alone = alone.merge(find_outliers(work.merge(known), basis=basis))
     for dim in ("light", "camera"):
@@ -282,6 +281,17 @@ def test_without_even_reflection__changes_no_prediction_and_no_picture(fitted, p
     other["fitted"] = xr.DataTree(moved)
     pictures = [from_model(tree).diffuse for tree in (model, other)]
     np.testing.assert_allclose(*pictures, rtol=1e-6)
+
+
+def test_fit_model__gloss_does_not_depend_on_the_size_of_the_basis(
+    fitted, planted, small_dictionary
+):
+    """One mixture has too much gloss for some surfels and too little for others."""
+    one = fit_model(planted, replace(HELD_OUT, k=1), dictionary=small_dictionary)
+    for name in ("surface_reflectance", "glossiness"):
+        values, of_three = (tree["fitted"][name].values for tree in (one, fitted[0]))
+        np.testing.assert_allclose(values, of_three, rtol=1e-6)
+        assert np.nanstd(values) > 0.01 * np.nanmean(values)
 
 
 def _fit_with(capture, dictionary, group, **scalars):
