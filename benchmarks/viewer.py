@@ -23,8 +23,10 @@ GESTURES = """async () => {
         input.value = Number(input.min) + (0.5 + 0.01 * (i % 9)) * (input.max - input.min);
         input.dispatchEvent(new Event("input"));
     };
-    const gestures = {turn: key(false), light: key(true)};
-    const sliders = "#environment [type=range], #traits [type=range]";
+    const zoom = (i) => canvas.dispatchEvent(new WheelEvent("wheel", {deltaY: i % 2 ? 50 : -50}));
+    const gestures = {turn: key(false), light: key(true), zoom};
+    const sliders = "#lights :first-child [type=range], #environment [type=range], "
+        + "#camera [type=range], #traits [type=range]";
     for (const input of document.querySelectorAll(sliders))
         gestures[`slider of ${input.ariaLabel}`] = slide(input);
     for (const [name, act] of Object.entries(gestures)) {

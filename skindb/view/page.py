@@ -42,9 +42,10 @@ APPROXIMATIONS = (
     "square distance of the dipole and the local diffusion length. Diffuse light of the "
     "environment comes from spherical harmonics of the order 3 at each surfel, its "
     "reflection by the surface from 256 distant lights, and from a smooth image while "
-    "something moves. Without a graphics card, fewer pixels, texels and vertices are used "
-    "until the picture rests. Light that is reflected more than once is not included. skindb "
-    "render omits it too, but has none of the other approximations."
+    "something moves. Without a graphics card, light is computed at vertices 2 mm apart, "
+    "with fewer pixels and texels, until the picture rests. Light that is reflected more "
+    "than once is not included. skindb render omits it too, but has none of the other "
+    "approximations."
 )
 LOCAL = "127.0.0.1"
 # another port is that of a tunnel

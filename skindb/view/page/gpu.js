@@ -37,7 +37,7 @@ function setUniforms(gl, { program, uniforms }, values) {
   gl.useProgram(program);
   for (const [name, [kind, value]] of Object.entries(values)) {
     if (!(name in uniforms)) continue;
-    if (kind === "mat4") gl.uniformMatrix4fv(uniforms[name], false, value);
+    if (kind.startsWith("Matrix")) gl[`uniform${kind}`](uniforms[name], false, value);
     else gl[`uniform${kind}`](uniforms[name], value);
   }
 }
@@ -75,12 +75,18 @@ function detailTexture(gl, bytes) {
   return texture;
 }
 
-function target(gl, size) {
-  const texture = halfTexture(gl, size, size, gl.HALF_FLOAT, null);
+function target(gl, width, height = width) {
+  const texture = halfTexture(gl, width, height, gl.HALF_FLOAT, null);
   const frame = gl.createFramebuffer();
   gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
   gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
-  return { texture, frame, size };
+  return { texture, frame, width, height };
+}
+
+function deleteTarget(gl, { texture, frame, depth = null }) {
+  gl.deleteTexture(texture);
+  gl.deleteFramebuffer(frame);
+  gl.deleteRenderbuffer(depth);
 }
 
 // half floats of the size of the picture with a depth buffer, in which passes are summed
@@ -108,16 +114,28 @@ function shadowTarget(gl, size, layers) {
   return { texture, frame: gl.createFramebuffer(), size };
 }
 
-function attribute(gl, location, size, type, values) {
-  gl.bindBuffer(gl.ARRAY_BUFFER, values);
-  gl.enableVertexAttribArray(location);
-  gl.vertexAttribPointer(location, size, type, false, 0, 0);
-}
-
-function buffer(gl, location, size, type, values) {
+// values of vertices, of which each takes a location for every four numbers
+function buffer(gl, location, size, values) {
   const made = gl.createBuffer();
   gl.bindBuffer(gl.ARRAY_BUFFER, made);
   gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
-  attribute(gl, location, size, type, made);
+  for (let at = 0; at < size; at += 4) {
+    gl.enableVertexAttribArray(location + at / 4);
+    gl.vertexAttribPointer(location + at / 4, Math.min(size, 4), gl.FLOAT, false, 4 * size, 4 * at);
+  }
   return made;
+}
+
+// numbers of vertices, for `drawIndices`
+function indices(gl, values) {
+  const made = gl.createBuffer();
+  gl.bindVertexArray(null);
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, made);
+  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, values, gl.STATIC_DRAW);
+  return { buffer: made, count: values.length };
+}
+
+function drawIndices(gl, kind, { buffer, count }) {
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffer);
+  gl.drawElements(kind, count, gl.UNSIGNED_INT, 0);
 }

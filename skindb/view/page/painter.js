@@ -1,8 +1,8 @@
 // Draws one face, or the original and the edited face side by side, into a canvas.
 "use strict";
 
-const COARSE_MM = 2;  // between vertices while something moves without a graphics card, about two pixels
-const SHADOW_SIZE = 1024, GLOW_SIZE = 384, COARSE_GLOW_SIZE = 192, FACE_HEIGHT_OVER_WIDTH = 1.5;
+const COARSE_MM = 2, CASTER_MM = 4;  // between vertices of faces and shadows while something moves without a graphics card
+const SHADOW_SIZE = 1024, GLOW_SIZE = 384, COARSE_GLOW_SIZE = 128, LIGHT_WIDTH = 512, FACE_HEIGHT_OVER_WIDTH = 1.5;
 
 // lights in groups of at most the number that one pass can process
 function batches(lights) {
@@ -26,13 +26,13 @@ class Painter {
     this.floats = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
     this.programs = Object.fromEntries(Object.keys(SHADERS).map((name) => [name, compile(gl, name)]));
     this.programs.faceOfMany = compile(gl, "face", "SECOND_TABLE");
-    this.programs.coarse = compile(gl, "face", "COARSE");
-    this.programs.coarseOfMany = compile(gl, "face", "COARSE", "SECOND_TABLE");
+    this.programs.lightOfMany = compile(gl, "light", "SECOND_TABLE");
+    this.programs.irradianceAtVertices = compile(gl, "irradiance", "AT_VERTICES");
     this.shadow = shadowTarget(gl, SHADOW_SIZE, MAX_LIGHTS);
     this.glows = {};
     this.empty = gl.createVertexArray();
     this.sides = {};
-    this.fewer = this.sum = this.sums = this.tableA = this.tableB = this.lobes = this.mirror = this.detail = null;
+    this.points = this.caster = this.light = this.sum = this.sums = this.tableA = this.tableB = this.lobes = this.mirror = this.detail = null;
   }
 
   load(face) {
@@ -47,14 +47,9 @@ class Painter {
     }
     this.face = face;
     this.visible = new VisibleTriangles(face);
-    this.coarse = this.software ? new VisibleTriangles({ ...face, triangles: fewerTriangles(face, COARSE_MM) }) : this.visible;
-    gl.deleteBuffer(this.fewer);
-    this.fewer = gl.createBuffer();
-    gl.bindVertexArray(null);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.fewer);
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, this.coarse.triangles, gl.STATIC_DRAW);
+    if (this.software) this.loadCoarse(face);
     for (const name of ["tableA", "tableB", "lobes", "detail"]) if (this[name]) gl.deleteTexture(this[name]);
-    this.ambient = buffer(gl, 9, 4, gl.FLOAT, new Float32Array((4 * face.position.length) / 3));
+    this.open = face.transfer.reduce((most, value, i) => (i % 16 ? most : Math.max(most, value)), 0);
     this.sides = Object.fromEntries(names.map((name) => [name, this.side(face)]));
     this.tableA = table3d(gl, face.tableShape, face.tableA);
     this.tableB = face.tableB ? table3d(gl, face.tableShape, face.tableB) : this.tableA;
@@ -62,21 +57,26 @@ class Painter {
     this.lobes = halfTexture(gl, face.tableLobes.length / 8, 2, gl.HALF_FLOAT, face.tableLobes);
   }
 
+  loadCoarse(face) {
+    const gl = this.gl;
+    this.coarse = new VisibleTriangles({ ...face, triangles: fewerTriangles(face, COARSE_MM) });
+    for (const one of [this.points, this.caster]) if (one) gl.deleteBuffer(one.buffer);
+    this.points = indices(gl, this.coarse.corners.sort());
+    this.caster = indices(gl, fewerTriangles(face, CASTER_MM));
+    if (this.light) deleteTarget(gl, this.light);
+    this.light = target(gl, LIGHT_WIDTH, Math.ceil(face.spacing.length / LIGHT_WIDTH));
+  }
+
   side(face) {
     const gl = this.gl, vao = gl.createVertexArray();
     gl.bindVertexArray(vao);
     const buffers = [
-      ...VALUES.map((name, at) => buffer(gl, at, name.startsWith("weight") ? 4 : 3, gl.FLOAT, face[name])),
-      buffer(gl, 6, 2, gl.FLOAT, face.uv), buffer(gl, 7, 1, gl.FLOAT, face.spacing),
-      buffer(gl, 8, 2, gl.FLOAT, face.quality),
+      ...VALUES.map((name, at) => buffer(gl, at, name.startsWith("weight") ? 4 : 3, face[name])),
+      buffer(gl, 6, 2, face.uv), buffer(gl, 7, 1, face.spacing), buffer(gl, 8, 2, face.quality), buffer(gl, 9, 16, face.transfer),
     ];
-    attribute(gl, 9, 4, gl.FLOAT, this.ambient);
-    const index = gl.createBuffer();
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, index);
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, face.triangles, gl.STATIC_DRAW);
-    gl.bindVertexArray(null);
+    const index = indices(gl, face.triangles);
     const list = gl.createBuffer();  // of the visible triangles, made again for each view
-    return { vao, buffers: [...buffers, index, list], index, list, visible: [this.visible, this.coarse], values: face, seen: "", size: 0, glow: {}, spread: 0 };
+    return { vao, buffers: [...buffers, index.buffer, list], index, list, visible: [this.visible, this.coarse], values: face, seen: "", size: 0, glow: {}, spread: 0 };
   }
 
   // Changes the values of the edited side; `differ` is whether it differs from the plain one.
@@ -103,12 +103,12 @@ class Painter {
 
   // Draws a picture, or the next part of a picture in an environment; returns the fraction that is done. With
   // `coarse`, while something moves, the environment has a smooth reflection and, without a graphics card, the face has
-  // fewer vertices, and light under the skin fewer texels.
+  // fewer vertices, at which light is computed, and light under the skin fewer texels.
   draw(state, coarse = false) {
     const gl = this.gl, { width, height } = this.canvas, lights = state.lights.slice(0, MAX_LIGHTS);
     if (!this.face || gl.isContextLost()) return 1;
     this.updateSky(state.around);
-    const shown = { lights, sums: null, mirror: state.around.on, coarse: coarse && this.software };
+    const shown = { lights, sums: null, mirror: state.around.on, coarse: coarse && this.software && this.floats !== null };
     const asked = JSON.stringify([{ ...state, background: 0 }, width, height, coarse], (key, value) => (key === "inputs" ? 0 : value));
     const isSum = state.around.on && state.withSurface && !state.component && this.floats && !coarse;
     if (!isSum || !this.sum || this.sum.asked !== asked) {
@@ -156,25 +156,20 @@ class Painter {
   beginSum() {
     const gl = this.gl, { width, height } = this.canvas;
     if (!this.sums || this.sums.width !== width || this.sums.height !== height) {
-      if (this.sums) {
-        gl.deleteTexture(this.sums.texture);
-        gl.deleteRenderbuffer(this.sums.depth);
-        gl.deleteFramebuffer(this.sums.frame);
-      }
+      if (this.sums) deleteTarget(gl, this.sums);
       this.sums = sumTarget(gl, width, height);
     }
     gl.depthMask(true);
     this.clear(this.sums.frame, null);
   }
 
-  // the irradiance by the environment at the surfels, and its mirror image
+  // the harmonics of the environment and its mirror image
   updateSky(around) {
     const sky = JSON.stringify(around), gl = this.gl;
     if (sky === this.sky) return;
     this.sky = sky;
     this.distant = around.on ? distantLights(this.face, around) : [];
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.ambient);
-    gl.bufferSubData(gl.ARRAY_BUFFER, 0, skyIrradiance(this.face, this.distant));
+    this.harmonics = skyHarmonics(this.distant);
     gl.deleteTexture(this.mirror);
     this.mirror = halfTexture(gl, MIRROR.width, MIRROR.height, gl.FLOAT, mirrorImage(this.distant));
   }
@@ -231,8 +226,8 @@ class Painter {
     });
     const uniforms = {
       lightCount: ["1i", lights.length], lightPosition: ["3fv", position], lightIntensity: ["3fv", intensity],
-      lightMatrix: ["mat4", all], shadowMap: ["1i", 0], eta: ["1f", this.face.eta], shadowRadius: ["1f", state.softness],
-      singleTap: ["1i", this.software && !state.fine ? 1 : 0],
+      lightMatrix: ["Matrix4fv", all], shadowMap: ["1i", 0], eta: ["1f", this.face.eta], shadowRadius: ["1f", state.softness],
+      singleTap: ["1i", this.software && !state.fine ? 1 : 0], sky: ["Matrix4x3fv", this.harmonics], open: ["1f", this.open],
     };
     return { uniforms, matrices };
   }
@@ -256,17 +251,9 @@ class Painter {
       this.shadowed[i] = coarse ? fewer : fine;
       gl.framebufferTextureLayer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, this.shadow.texture, 0, i);
       gl.clear(gl.DEPTH_BUFFER_BIT);
-      setUniforms(gl, this.programs.depth, { matrix: ["mat4", matrix] });
-      this.drawAll(side, coarse);
+      setUniforms(gl, this.programs.depth, { matrix: ["Matrix4fv", matrix] });
+      drawIndices(gl, gl.TRIANGLES, coarse ? this.caster : side.index);
     });
-  }
-
-  // Draws all triangles of a side, or between fewer vertices while something moves.
-  drawAll(side, coarse) {
-    const gl = this.gl, { triangles } = coarse ? this.coarse : this.visible;
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, coarse ? this.fewer : side.index);
-    gl.drawElements(gl.TRIANGLES, triangles.length, gl.UNSIGNED_INT, 0);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, side.index);
   }
 
   // Light under the skin of a side as a texture. Sides with equal shape and translucency share it, and it stays the
@@ -292,7 +279,7 @@ class Painter {
     gl.viewport(0, 0, size, size);
     this.bindTextures([[gl.TEXTURE_2D_ARRAY, this.shadow.texture]]);
     gl.bindVertexArray(side.vao);
-    const passes = [[light, "irradiance", uniforms]];
+    const coarse = size === COARSE_GLOW_SIZE, passes = [[light, coarse ? "irradianceAtVertices" : "irradiance", uniforms]];
     if (side.spread !== size) passes.push([radius, "radius", { width: ["3fv", face.diffusionWidth.map((x) => x * size)] }]);
     side.spread = size;
     for (const [to, program, values] of passes) {
@@ -300,7 +287,8 @@ class Painter {
       gl.clearColor(0, 0, 0, 0);
       gl.clear(gl.COLOR_BUFFER_BIT);
       setUniforms(gl, this.programs[program], values);
-      this.drawAll(side, size === COARSE_GLOW_SIZE);
+      if (coarse) drawIndices(gl, gl.POINTS, this.points);
+      else drawIndices(gl, gl.TRIANGLES, side.index);
     }
     gl.bindVertexArray(this.empty);
     for (const [from, to, along] of [[light, across, [1, 0]], [across, blurred, [0, 1]]]) {
@@ -321,27 +309,43 @@ class Painter {
     const matrix = through
       ? throughCamera(through, this.canvas, near, far)
       : product(perspective(tangent, width / height, near, far), lookAt(eye, state.target || face.centre, [0, 1, 0]));
-    gl.enable(gl.DEPTH_TEST);
-    gl.enable(gl.CULL_FACE);
     this.bindTextures([
       [gl.TEXTURE_2D_ARRAY, this.shadow.texture], [gl.TEXTURE_3D, this.tableA], [gl.TEXTURE_3D, this.tableB],
       [gl.TEXTURE_2D, glow], [gl.TEXTURE_2D, this.mirror], [gl.TEXTURE_2D, this.lobes],
       [gl.TEXTURE_2D, this.detail],
     ]);
-    const program = state.component ? "components" : (coarse ? "coarse" : "face") + (face.tableB ? "OfMany" : "");
-    setUniforms(gl, this.programs[program], {
-      ...uniforms, matrix: ["mat4", matrix], eye: ["3fv", eye], exposure: ["1f", state.exposure * face.exposure],
+    const values = {
+      ...uniforms, source: ["1i", 1], matrix: ["Matrix4fv", matrix], eye: ["3fv", eye], exposure: ["1f", state.exposure * face.exposure],
       tableA: ["1i", 1], tableB: ["1i", 2], glow: ["1i", 3], mirror: ["1i", 4], lobes: ["1i", 5], detail: ["1i", 6], withDetail: ["1i", face.detail ? 1 : 0],
       withDiffuse: ["1i", state.withDiffuse ? 1 : 0], withSurface: ["1i", state.withSurface ? 1 : 0],
       withGlow: ["1i", glow ? 1 : 0], withMirror: ["1i", mirror ? 1 : 0],
       linear: ["1i", sums ? 1 : 0], toned: ["1i", state.toned ? 1 : 0], component: ["1i", state.component],
-    });
-    const side = this.sides[name];
+    };
+    const side = this.sides[name], atVertices = coarse && !state.component, many = face.tableB ? "OfMany" : "";
     gl.bindVertexArray(side.vao);
+    if (atVertices) this.drawLight(this.programs[`light${many}`], values);
+    gl.enable(gl.DEPTH_TEST);
+    gl.enable(gl.CULL_FACE);
+    setUniforms(gl, this.programs[state.component ? "components" : atVertices ? "coarse" : `face${many}`], values);
     this.selectVisible(side, eye, matrix, span, coarse);
     gl.drawElements(gl.TRIANGLES, side.size, gl.UNSIGNED_INT, 0);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, side.index);
     gl.bindVertexArray(null);
+  }
+
+  // Computes the radiance of the vertices that are drawn while something moves, into a texture for the program `coarse`.
+  // Each is computed once, but pixels of triangles of their size several times without a graphics card.
+  drawLight(program, values) {
+    const gl = this.gl, { frame, texture, width, height } = this.light;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+    gl.viewport(0, 0, width, height);
+    for (const one of [gl.DEPTH_TEST, gl.CULL_FACE, gl.SCISSOR_TEST]) gl.disable(one);
+    setUniforms(gl, program, { ...values, size: ["2iv", [width, height]] });
+    drawIndices(gl, gl.POINTS, this.points);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, this.canvas.width, this.canvas.height);
+    gl.enable(gl.SCISSOR_TEST);
+    gl.activeTexture(gl.TEXTURE1);
+    gl.bindTexture(gl.TEXTURE_2D, texture);
   }
 
   // binds the list of the triangles of a side that the view shows

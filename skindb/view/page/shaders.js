@@ -40,6 +40,50 @@ float lit(int i, vec3 position, vec3 normal) {
 }
 `;
 
+// irradiance under the boundary by the environment, and the openness of the surface, from 0 to 1 without anything in the way
+const AMBIENT = `
+layout(location = 9) in mat4 transfer;
+uniform mat4x3 sky[4];
+uniform float open;  // largest first coefficient
+vec4 ambient() {
+  vec3 sum = sky[0] * transfer[0] + sky[1] * transfer[1] + sky[2] * transfer[2] + sky[3] * transfer[3];
+  return vec4(max(sum, 0.0), transfer[0][0] / open);
+}
+`;
+
+// irradiance under the boundary by lights and environment, computed at texels or, with AT_VERTICES, at vertices
+const IRRADIANCE = `
+vec3 irradiance(vec3 position, vec3 n, vec3 sum) {
+  for (int i = 0; i < lightCount; i++) {
+    vec3 way = lightPosition[i] - position;
+    float square = dot(way, way), c = dot(way, n) * inversesqrt(square);
+    if (c > 0.0) sum += lightIntensity[i] * (c / square * transmittance(c) * lit(i, position, n));
+  }
+  return sum;
+}
+`;
+
+// values of a surfel for RADIANCE, as variables or as outputs
+const surfel = (kind) => `
+layout(location = 0) in vec3 position;
+layout(location = 1) in vec3 normal;
+layout(location = 2) in vec3 albedo;
+layout(location = 3) in vec4 weightA;
+layout(location = 4) in vec4 weightB;
+layout(location = 6) in vec2 uv;
+${kind} vec3 vPosition; ${kind} vec3 vNormal; ${kind} vec3 vAlbedo; ${kind} vec4 vWeightA; ${kind} vec2 vUv; ${kind} vec4 vAmbient;
+#ifdef SECOND_TABLE
+${kind} vec4 vWeightB;
+#endif
+${AMBIENT}
+void setSurfel() {
+  vPosition = position; vNormal = normal; vAlbedo = albedo; vWeightA = weightA; vUv = uv; vAmbient = ambient();
+#ifdef SECOND_TABLE
+  vWeightB = weightB;
+#endif
+}
+`;
+
 // changes of albedo (below in the texture) and normal (above) that are finer than the surfels
 const DETAIL = `
 uniform bool withDetail;
@@ -50,6 +94,76 @@ vec3 finer(float side) {
 }
 vec3 finerAlbedo(vec3 albedo) { return albedo * (1.0 + finer(0.0)); }
 vec3 finerNormal(vec3 normal) { return normalize(normal + finer(1.0)); }
+`;
+
+// radiance at pixels or, with AT_VERTICES, at vertices
+const RADIANCE = `
+uniform sampler3D tableA;
+uniform sampler3D tableB;
+uniform sampler2D glow;
+uniform vec3 eye;
+uniform bool withDiffuse, withSurface, withGlow;
+uniform bool withMirror;  // whether the surface reflects a smooth image of the environment
+uniform sampler2D mirror;
+uniform sampler2D lobes;  // directional albedo of the bases
+const float MIN_COSINE = 0.03;
+
+// half and difference angles (Rusinkiewicz 1998) as coordinates of the tables
+vec3 place(vec3 n, vec3 wi, vec3 wo) {
+  vec3 h = normalize(wi + wo);
+  vec3 b = cross(n, h), t = cross(b, h);
+  float sinH = length(b), sinD = length(cross(h, wi));
+  float thetaH = atan(sinH, max(dot(n, h), 0.0)), thetaD = atan(sinD, max(dot(h, wi), 0.0));
+  float phi = sinH > 1e-6 ? atan(dot(b, wi), dot(t, wi)) : 0.0;
+  if (phi < 0.0) phi += PI;
+  vec3 size = vec3(textureSize(tableA, 0));
+  vec2 at = vec2(thetaD, thetaH) / (0.5 * PI);
+  at.y = sqrt(at.y);
+  return vec3((clamp(at, 0.0, 1.0) * (size.xy - 1.0) + 0.5) / size.xy, phi / PI + 0.5 / size.z);
+}
+
+// adds the reflection of one light
+void reflected(int i, vec3 n, vec3 wo, float leaves, inout vec3 matte, inout vec3 gloss) {
+  vec3 way = lightPosition[i] - vPosition;
+  float square = dot(way, way);
+  vec3 wi = way * inversesqrt(square);
+  float cosI = dot(wi, n);
+  if (cosI <= 0.0) return;
+  float visible = lit(i, vPosition, n);
+  if (visible == 0.0) return;
+  vec3 received = lightIntensity[i] * (cosI / square * visible);
+  if (!withGlow) matte += received * (transmittance(min(cosI, 1.0)) * leaves / PI);
+  if (!withSurface) return;
+  vec3 at = place(n, wi, wo);
+  float sum = dot(vWeightA, texture(tableA, at));
+#ifdef SECOND_TABLE
+  sum += dot(vWeightB, texture(tableB, at));
+#endif
+  gloss += received * sum;
+}
+vec3 radiance(vec3 n, vec3 albedo) {
+  vec3 wo = normalize(eye - vPosition), matte = vec3(0.0), gloss = vec3(0.0);
+  float cosO = dot(n, wo);
+  if (cosO < MIN_COSINE) n = normalize(n + (MIN_COSINE - cosO) * wo);  // no black line where shading normals turn away
+  cosO = clamp(cosO, MIN_COSINE, 1.0);
+  float leaves = transmittance(cosO);
+  // not a loop, which takes more time without a graphics card
+  ${[...Array(MAX_LIGHTS).keys()].map((i) => `if (${i} < lightCount) reflected(${i}, n, wo, leaves, matte, gloss);`).join("\n  ")}
+  vec4 under = withGlow ? texture(glow, vUv) : vec4(vAmbient.rgb, 1.0);
+#ifdef AT_VERTICES
+  under /= max(under.a, 0.01);  // texels without a vertex are empty
+#endif
+  matte += under.rgb * (leaves / PI);
+  if (withSurface && withMirror) {
+    vec3 way = reflect(-wo, n);
+    float reflectance = dot(vWeightA, texture(lobes, vec2(cosO, 0.25)));
+#ifdef SECOND_TABLE
+    reflectance += dot(vWeightB, texture(lobes, vec2(cosO, 0.75)));
+#endif
+    gloss += texture(mirror, vec2(atan(way.x, way.z) / (2.0 * PI) + 0.5, acos(clamp(way.y, -1.0, 1.0)) / PI)).rgb * (reflectance * vAmbient.a);
+  }
+  return (withDiffuse ? matte * albedo : vec3(0.0)) + gloss;
+}
 `;
 
 const ENCODE = `
@@ -84,28 +198,37 @@ void main() {}`,
 
   // irradiance under the boundary in texture space
   irradiance: {
-    vertex: `#version 300 es
+    vertex: COMMON + `
 layout(location = 0) in vec3 position;
 layout(location = 1) in vec3 normal;
 layout(location = 6) in vec2 uv;
-layout(location = 9) in vec4 ambient;
+${AMBIENT}
+#ifdef AT_VERTICES
+flat out vec3 vIrradiance;
+${IRRADIANCE}
+#else
 out vec3 vPosition; out vec3 vNormal; out vec3 vAmbient;
+#endif
 void main() {
-  vPosition = position; vNormal = normal; vAmbient = ambient.rgb;
+#ifdef AT_VERTICES
+  vIrradiance = irradiance(position, normal, ambient().rgb);
+#else
+  vPosition = position; vNormal = normal; vAmbient = ambient().rgb;
+#endif
+  gl_PointSize = 1.0;
   gl_Position = vec4(uv * 2.0 - 1.0, 0.0, 1.0);
 }`,
     fragment: COMMON + `
-in vec3 vPosition; in vec3 vNormal; in vec3 vAmbient;
 out vec4 result;
-void main() {
-  vec3 n = normalize(vNormal), sum = vAmbient;
-  for (int i = 0; i < lightCount; i++) {
-    vec3 way = lightPosition[i] - vPosition;
-    float square = dot(way, way), c = dot(way, n) * inversesqrt(square);
-    if (c > 0.0) sum += lightIntensity[i] * (c / square * transmittance(c) * lit(i, vPosition, n));
-  }
-  result = vec4(sum, 1.0);
-}`,
+#ifdef AT_VERTICES
+flat in vec3 vIrradiance;
+void main() { result = vec4(vIrradiance, 1.0); }
+#else
+in vec3 vPosition; in vec3 vNormal; in vec3 vAmbient;
+${IRRADIANCE}
+void main() { result = vec4(irradiance(vPosition, normalize(vNormal), vAmbient), 1.0); }
+#endif
+`,
   },
 
   // standard deviation [texels] of the blur in texture space
@@ -118,6 +241,7 @@ uniform vec3 width;
 out vec3 vRadius;
 void main() {
   vRadius = width * diffusion / spacing;
+  gl_PointSize = 1.0;
   gl_Position = vec4(uv * 2.0 - 1.0, 0.0, 1.0);
 }`,
     fragment: `#version 300 es
@@ -193,103 +317,72 @@ void main() {
 
   face: {
     vertex: `#version 300 es
-layout(location = 0) in vec3 position;
-layout(location = 1) in vec3 normal;
-layout(location = 2) in vec3 albedo;
-layout(location = 3) in vec4 weightA;
-layout(location = 4) in vec4 weightB;
-layout(location = 6) in vec2 uv;
-layout(location = 9) in vec4 ambient;
+${surfel("out")}
 uniform mat4 matrix;
-out vec3 vPosition; out vec3 vNormal; out vec3 vAlbedo; out vec4 vWeightA; out vec2 vUv; out vec4 vAmbient;
-#ifdef SECOND_TABLE
-out vec4 vWeightB;
-#endif
 void main() {
-  vPosition = position; vNormal = normal; vAlbedo = albedo; vWeightA = weightA; vUv = uv; vAmbient = ambient;
-#ifdef SECOND_TABLE
-  vWeightB = weightB;
-#endif
+  setSurfel();
   gl_Position = matrix * vec4(position, 1.0);
 }`,
     fragment: COMMON + `
-uniform sampler3D tableA;
-uniform sampler3D tableB;
-uniform sampler2D glow;
-uniform vec3 eye;
 uniform float exposure;
-uniform bool withDiffuse, withSurface, withGlow;
-uniform bool withMirror;  // whether the surface reflects a smooth image of the environment
-uniform sampler2D mirror;
-uniform sampler2D lobes;  // directional albedo of the bases
 uniform bool linear;  // whether to output radiance, to be summed, instead of a display colour
-const float MIN_COSINE = 0.03;
 in vec3 vPosition; in vec3 vNormal; in vec3 vAlbedo; in vec4 vWeightA; in vec4 vAmbient;
 #ifdef SECOND_TABLE
 in vec4 vWeightB;
 #endif
 out vec4 result;
-
-// half and difference angles (Rusinkiewicz 1998) as coordinates of the tables
-vec3 place(vec3 n, vec3 wi, vec3 wo) {
-  vec3 h = normalize(wi + wo);
-  vec3 b = cross(n, h), t = cross(b, h);
-  float sinH = length(b), sinD = length(cross(h, wi));
-  float thetaH = atan(sinH, max(dot(n, h), 0.0)), thetaD = atan(sinD, max(dot(h, wi), 0.0));
-  float phi = sinH > 1e-6 ? atan(dot(b, wi), dot(t, wi)) : 0.0;
-  if (phi < 0.0) phi += PI;
-  vec3 size = vec3(textureSize(tableA, 0));
-  vec2 at = vec2(thetaD, thetaH) / (0.5 * PI);
-  at.y = sqrt(at.y);
-  return vec3((clamp(at, 0.0, 1.0) * (size.xy - 1.0) + 0.5) / size.xy, phi / PI + 0.5 / size.z);
-}
-
 ${DETAIL}
 ${ENCODE}
-// adds the reflection of one light
-void reflected(int i, vec3 n, vec3 wo, float leaves, inout vec3 matte, inout vec3 gloss) {
-  vec3 way = lightPosition[i] - vPosition;
-  float square = dot(way, way);
-  vec3 wi = way * inversesqrt(square);
-  float cosI = dot(wi, n);
-  if (cosI <= 0.0) return;
-  float visible = lit(i, vPosition, n);
-  if (visible == 0.0) return;
-  vec3 received = lightIntensity[i] * (cosI / square * visible);
-  if (!withGlow) matte += received * (transmittance(min(cosI, 1.0)) * leaves / PI);
-  if (!withSurface) return;
-  vec3 at = place(n, wi, wo);
-  float sum = dot(vWeightA, texture(tableA, at));
-#ifdef SECOND_TABLE
-  sum += dot(vWeightB, texture(tableB, at));
-#endif
-  gloss += received * sum;
-}
+${RADIANCE}
 void main() {
-  vec3 n = finerNormal(vNormal);
-  vec3 wo = normalize(eye - vPosition), matte = vec3(0.0), gloss = vec3(0.0);
-  float cosO = dot(n, wo);
-  if (cosO < MIN_COSINE) n = normalize(n + (MIN_COSINE - cosO) * wo);  // no black line where shading normals turn away
-  cosO = clamp(cosO, MIN_COSINE, 1.0);
-  float leaves = transmittance(cosO);
-  // not a loop, which takes more time without a graphics card
-  ${[...Array(MAX_LIGHTS).keys()].map((i) => `if (${i} < lightCount) reflected(${i}, n, wo, leaves, matte, gloss);`).join("\n  ")}
-  vec4 under = withGlow ? texture(glow, vUv) : vec4(vAmbient.rgb, 1.0);
-#ifdef COARSE
-  under /= max(under.a, 0.01);  // large texels at the border are partly empty
-#endif
-  matte += under.rgb * (leaves / PI);
-  if (withSurface && withMirror) {
-    vec3 way = reflect(-wo, n);
-    float albedo = dot(vWeightA, texture(lobes, vec2(cosO, 0.25)));
-#ifdef SECOND_TABLE
-    albedo += dot(vWeightB, texture(lobes, vec2(cosO, 0.75)));
-#endif
-    gloss += texture(mirror, vec2(atan(way.x, way.z) / (2.0 * PI) + 0.5, acos(clamp(way.y, -1.0, 1.0)) / PI)).rgb * (albedo * vAmbient.a);
-  }
-  vec3 radiance = (withDiffuse ? matte * finerAlbedo(vAlbedo) : vec3(0.0)) + gloss;
-  result = vec4(linear ? radiance * exposure : shown(radiance * exposure), 1.0);
+  vec3 sum = exposure * radiance(finerNormal(vNormal), finerAlbedo(vAlbedo));
+  result = vec4(linear ? sum : shown(sum), 1.0);
 }`,
+  },
+
+  // radiance of the vertices that face the eye, each at a texel of its own
+  light: {
+    vertex: COMMON + `
+#define AT_VERTICES
+${surfel("")}
+${RADIANCE}
+uniform ivec2 size;
+flat out vec3 vRadiance;
+void main() {
+  setSurfel();
+  gl_PointSize = 1.0;
+  gl_Position = vec4((vec2(gl_VertexID % size.x, gl_VertexID / size.x) + 0.5) / vec2(size) * 2.0 - 1.0, 0.0, 1.0);
+  vRadiance = dot(normal, normalize(eye - position)) < -0.5 ? vec3(0.0) : radiance(normal, albedo);
+}`,
+    fragment: `#version 300 es
+precision highp float;
+flat in vec3 vRadiance;
+out vec4 result;
+void main() { result = vec4(vRadiance, 1.0); }`,
+  },
+
+  // the face between vertices whose radiance is known
+  coarse: {
+    vertex: `#version 300 es
+layout(location = 0) in vec3 position;
+layout(location = 6) in vec2 uv;
+uniform mat4 matrix;
+uniform highp sampler2D source;
+out vec3 vRadiance; out vec2 vUv;
+void main() {
+  int width = textureSize(source, 0).x;
+  vRadiance = texelFetch(source, ivec2(gl_VertexID % width, gl_VertexID / width), 0).rgb;
+  vUv = uv;
+  gl_Position = matrix * vec4(position, 1.0);
+}`,
+    fragment: `#version 300 es
+precision highp float;
+uniform float exposure;
+in vec3 vRadiance;
+out vec4 result;
+${DETAIL}
+${ENCODE}
+void main() { result = vec4(shown(exposure * finerAlbedo(vRadiance)), 1.0); }`,
   },
 
   // sum of the passes as display colours

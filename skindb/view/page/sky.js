@@ -1,4 +1,4 @@
-// Light from all directions: distant lights, the irradiance by them from precomputed transfer, and their mirror image.
+// Light from all directions: distant lights, the spherical harmonics of their radiance, and their mirror image.
 "use strict";
 
 const MIRROR = { width: 32, height: 16, sharpness: 15 };  // exp(sharpness (cos - 1)), 15 degrees wide as the gaps of the lights
@@ -23,27 +23,13 @@ function harmonics([x, y, z]) {
   ].map((value) => value / r(Math.PI));
 }
 
-// irradiance under the boundary (n x 3), and the openness of the surface, from 0 to 1 without anything in the way
-function skyIrradiance({ transfer }, lights) {
-  const count = transfer.length / 16, out = new Float32Array(4 * count), sky = new Float32Array(48);
+// coefficients of the radiance of the lights (16 x 3), of which a product with the transfer of a surfel is the irradiance
+// under the boundary
+function skyHarmonics(lights) {
+  const sky = new Float32Array(48);
   for (const { towards, irradiance, power } of lights)
     harmonics(towards).forEach((value, k) => irradiance.forEach((e, c) => { sky[3 * k + c] += value * e * power; }));
-  let open = 0;
-  for (let i = 0; i < count; i++) open = Math.max(open, transfer[16 * i]);
-  for (let i = 0; i < count; i++) {
-    let red = 0, green = 0, blue = 0;
-    for (let k = 0; k < 16; k++) {
-      const t = transfer[16 * i + k];
-      red += t * sky[3 * k];
-      green += t * sky[3 * k + 1];
-      blue += t * sky[3 * k + 2];
-    }
-    out[4 * i] = Math.max(red, 0);
-    out[4 * i + 1] = Math.max(green, 0);
-    out[4 * i + 2] = Math.max(blue, 0);
-    out[4 * i + 3] = transfer[16 * i] / open;
-  }
-  return out;
+  return sky;
 }
 
 // radiance of the lights as a smooth image of all directions (height x width x 4)
