@@ -19,7 +19,6 @@ from skindb.ingest._detail_kernels import add_samples
 from skindb.ingest.surfels import SurfelSet
 from skindb.schema import dataset, variables
 from skindb.types import (
-    Array,
     Bytes,
     Float32,
     Float64,
@@ -31,7 +30,7 @@ from skindb.types import (
 
 # spacing of the surfels over the width of a pixel, from which on detail is estimated
 MIN_SPACING_PIXELS = 2.0
-# along a side of the atlas: a whole head at 0.3 mm; each texel takes 1 kB of memory while
+# along a side of the atlas: a whole head at 0.3 mm; each texel takes 0.6 kB of memory while
 # views are sampled
 MAX_TEXELS = 1536
 MIN_COSINE = (
@@ -45,6 +44,7 @@ MIN_SPREAD = 1e-3
 BLUR_PIXELS = 0.5
 # texels; standard deviation of the window in which noise and detail are compared
 WINDOW = 6.0
+BLOCK = 1 << 17  # points whose equations are in memory together
 
 
 def pixel_width(surfels: SurfelSet, cameras: Sequence[CameraRecord]) -> float:
@@ -148,42 +148,48 @@ class Detail:
         if not known.any():
             return None
         at = np.unravel_index(self.texel[known], (self.size, self.size))
-        cover = np.zeros((self.size, self.size, 1), np.float32)
-        cover[at] = 1
-        seen, even, odd = np.zeros((3, self.size, self.size, 6), np.float32)
-        for image, points in zip((seen, even, odd), values[:, known], strict=True):
-            image[at] = points
-        lost = seen - _smoothed(seen, cover, self.blur)
-        sharp = seen + lost
-        noise = even - odd
-        noise = (2 * noise - _smoothed(noise, cover, self.blur)) ** 2 / 4
-        noise = _smoothed(noise, cover, WINDOW)
-        total = _smoothed(sharp**2, cover, WINDOW)
-        kept = np.clip(1 - noise / np.maximum(total, 1e-12), 0, 1)
-        error = np.where(cover > 0, np.sqrt(kept * (noise + lost**2)), np.nan)
+        cover = self._image(at, np.float32(1))
+        # infinite outside, where means are 0
+        near, window = (
+            np.where(cover > 0, gaussian_filter(cover, sigma), np.float32(np.inf))
+            for sigma in (self.blur, WINDOW)
+        )
+        detail, error = np.empty((2, self.size, self.size, 6), np.float32)
+        # images of all channels would take most of the memory
+        for channel in range(6):
+            seen, even, odd = (self._image(at, v) for v in values[:, known, channel])
+            lost = seen - gaussian_filter(seen, self.blur) / near
+            sharp = seen + lost
+            noise = even - odd
+            noise = (2 * noise - gaussian_filter(noise, self.blur) / near) ** 2 / 4
+            noise = gaussian_filter(noise, WINDOW) / window
+            total = gaussian_filter(sharp**2, WINDOW) / window
+            kept = np.clip(1 - noise / np.maximum(total, 1e-12), 0, 1)
+            detail[..., channel] = kept * sharp
+            unknown = np.where(cover > 0, noise + lost**2, np.nan)
+            error[..., channel] = np.sqrt(kept * unknown)
         return dataset(
             {
-                variables.DIFFUSE_DETAIL: (kept * sharp)[..., :3],
+                variables.DIFFUSE_DETAIL: detail[..., :3],
                 variables.DIFFUSE_DETAIL_ERROR: error[..., :3],
-                variables.NORMAL_DETAIL: (kept * sharp)[..., 3:],
+                variables.NORMAL_DETAIL: detail[..., 3:],
                 variables.NORMAL_DETAIL_ERROR: error[..., 3:],
             },
             coords={"channel": ["R", "G", "B"]},
         )
 
-    def _differences(self, sums: Float32) -> Array:
+    def _image(self, at: tuple[Index, ...], values: Float32 | np.float32) -> Float32:
+        """Image of the values at these texels, 0 elsewhere."""
+        image = np.zeros((self.size, self.size), np.float32)
+        image[at] = values
+        return image
+
+    def _differences(self, sums: Float32) -> Float32:
         """Relative difference of R_d and difference of the unit normal (t, 6) of the texels
         from the interpolated surfels; NaN where they are not determined.
         """
-        gram = sums[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3).astype(float)
-        trace = np.maximum(np.trace(gram, axis1=1, axis2=2), 1e-9)
-        determined = np.linalg.det(gram) > MIN_SPREAD * (trace / 3) ** 3
-        values = np.full((len(sums), 6), np.nan)
-        right = sums[determined, 6:].reshape(-1, 3, 3).astype(float)
-        scaled = np.linalg.solve(gram[determined], right)  # (n, axis, channel)
-        normal = unit(scaled.sum(axis=2))
-        albedo = np.einsum("nkc,nk->nc", scaled, normal)
-        values[determined] = np.concatenate([albedo, normal], axis=1)
+        blocks = np.array_split(sums, len(sums) // BLOCK + 1)
+        values = np.concatenate([_lambert(block) for block in blocks])
         count = len(self.texel)
         texels, surfels = np.split(values, [count])
         smooth = np.einsum(
@@ -194,7 +200,15 @@ class Detail:
         return difference
 
 
-def _smoothed(image: Array, cover: Float32, sigma: float) -> Array:
-    """Gaussian means (h, w, c) of the texels with cover (h, w, 1)."""
-    total, weight = (gaussian_filter(x, sigma, axes=(0, 1)) for x in (image, cover))
-    return total / np.maximum(weight, np.float32(1e-6)) * (cover > 0)
+def _lambert(sums: Float32) -> Float32:
+    """R_d and the unit normal (n, 6) that the equations (n, 15) of points determine, or NaN."""
+    gram = sums[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3).astype(float)
+    trace = np.maximum(np.trace(gram, axis1=1, axis2=2), 1e-9)
+    determined = np.linalg.det(gram) > MIN_SPREAD * (trace / 3) ** 3
+    values = np.full((len(sums), 6), np.nan, np.float32)
+    right = sums[determined, 6:].reshape(-1, 3, 3).astype(float)
+    scaled = np.linalg.solve(gram[determined], right)  # (n, axis, channel)
+    normal = unit(scaled.sum(axis=2))
+    albedo = np.einsum("nkc,nk->nc", scaled, normal)
+    values[determined] = np.concatenate([albedo, normal], axis=1)
+    return values
