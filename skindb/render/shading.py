@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from skindb.errors import input_error
-from skindb.geometry.atlas import bilinear
 from skindb.geometry.mesh import face_crosses, vertex_areas
 from skindb.geometry.rays import RayScene
 from skindb.optics.dipole_tree import subsurface_exitance
@@ -300,12 +299,12 @@ def _facing_points(
     """Positions, unit normals, directions to the camera and `View.tint` (n, 3) of hits, and
     whether the surface faces the camera.
     """
-    tint = np.ones((1, 1))
+    tint: Array = np.ones((1, 1))
     normal = np.einsum("nk,nkc->nc", weight, surface.normals[corners])
     position = np.einsum("nk,nkc->nc", weight, surface.vertices[corners])
     if surface.detail is not None and surface.uv is not None:
         uv = np.einsum("nk,nkc->nc", weight, surface.uv[corners])
-        detail = bilinear(surface.detail, uv * len(surface.detail))
+        detail = surface.detail_at(uv)
         tint = 1 + detail[:, :3]
         normal += detail[:, 3:]
     with np.errstate(invalid="ignore"):
