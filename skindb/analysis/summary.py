@@ -38,7 +38,7 @@ MAX_HALF_ANGLE = 12.0
 PATCH_SIZE = 20.0
 # errors of mean surface reflectance and glossiness, relative to them, that takes have in
 # common by lobes of other shapes, and of lips by folds that are narrower than pixels.
-# Chosen on 10 virtual takes, validated on 27 (docs/results)
+# Chosen on 10 virtual takes, validated on 33 (docs/results)
 MODEL_ERRORS = {  # of lips, and of other regions
     variables.REGION_SURFACE_REFLECTANCE: (0.15, 0.06),
     variables.REGION_GLOSSINESS: (0.1, 0.05),
