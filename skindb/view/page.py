@@ -42,7 +42,7 @@ APPROXIMATIONS = (
     "square distance of the dipole and the local diffusion length. Diffuse light of the "
     "environment comes from spherical harmonics of the order 3 at each surfel, its "
     "reflection by the surface from 256 distant lights, and from a smooth image while "
-    "something moves. Without a graphics card, light is computed at vertices 2 mm apart, "
+    "something moves. Without a graphics card, light is computed at vertices 2.3 mm apart, "
     "with fewer pixels and texels, until the picture rests. Light that is reflected more "
     "than once is not included. skindb render omits it too, but has none of the other "
     "approximations."

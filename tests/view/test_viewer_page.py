@@ -225,7 +225,7 @@ def test_page__light_under_the_skin_is_near_that_of_the_octree(
     without, _ = compared(local, expected, view)
     # a Gaussian stands for the dipole, and 0.7 % is the error of the viewer without it
     assert error < 0.8 * without
-    assert coarse < 0.025, coarse  # light at vertices, and 128 texels instead of 384
+    assert coarse < 0.03, coarse  # light at vertices, and 128 texels instead of 384
     assert not page.problems
     page.close()
 
@@ -538,9 +538,9 @@ def test_page__light_at_fewer_vertices_is_near_that_at_pixels(browser, page_file
             [coarse.triangles.length, visible.triangles.length])(skindb.painter())"""
     )
     assert 0 < fewer < every / 3
-    # vertices 2 mm apart instead of 1 mm; the highlight of the sharpest lobe at the tip of
+    # vertices 2.3 mm apart instead of 1 mm; the highlight of the sharpest lobe at the tip of
     # the nose is 2 mm wide, so that vertices miss a part of it
-    for glow, surface, bound in [(0, 0, 0.012), (1, 0, 0.016), (0, 1, 0.04)]:
+    for glow, surface, bound in [(0, 0, 0.012), (1, 0, 0.02), (0, 1, 0.04)]:
         state = {"glow": bool(glow), "withSurface": bool(surface), "withDiffuse": True}
         state |= {"lights": [lamp([300, 0, 300])], "exposure": 0.6, "softness": 1}
         moving = square(page, picture=COARSE, **state)  # first: it prefers finer maps

@@ -1,7 +1,7 @@
 // Draws one face, or the original and the edited face side by side, into a canvas.
 "use strict";
 
-const COARSE_MM = 2, CASTER_MM = 4;  // between vertices of faces and shadows while something moves without a graphics card
+const COARSE_MM = 2.3, CASTER_MM = 5;  // between vertices of faces and shadows while something moves without a graphics card
 const SHADOW_SIZE = 1024, GLOW_SIZE = 384, COARSE_GLOW_SIZE = 128, LIGHT_WIDTH = 512, FACE_HEIGHT_OVER_WIDTH = 1.5;
 
 // lights in groups of at most the number that one pass can process
