@@ -17,6 +17,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Union, get_args, get_origin
 
+from skindb.errors import InputError
+
 FOLDER = Path(__file__).parent
 
 
@@ -87,7 +89,11 @@ def main(arguments: Sequence[str]) -> int:
     )
     add_options(parser, module.main)
     values = vars(parser.parse_args(options))
-    return int(module.main(**values) or 0)
+    try:
+        return int(module.main(**values) or 0)
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 1
 
 
 if __name__ == "__main__":
