@@ -15,6 +15,7 @@ import click
 import numpy as np
 import pytest
 from permissions import open_to_others
+from planted_cohort import PEOPLE, database
 
 import skindb
 from skindb.analysis import STUDIES
@@ -273,6 +274,14 @@ def test_cli__info_of_an_empty_database_is_json(tmp_path):
     done = _run("info", str(tmp_path), "--json")
     assert done.returncode == 0
     assert json.loads(done.stdout) == {"takes": {}}
+
+
+def test_info__paths_of_a_subject_called_data(tmp_path):
+    db = database(tmp_path / "data", {"data": PEOPLE["S01"]})
+    said = _run("info", str(db.root), "-v").stdout
+    paths = re.findall(r"data/\S+\.zarr", said)
+    assert len(paths) >= 2
+    assert all((db.root / path).is_dir() for path in paths), paths
 
 
 def test_cli__custom_dictionary(tmp_path):

@@ -166,6 +166,10 @@ def test_backup__names_damage_and_exits_with_1(db, dest, tmp_path):
 
 def test_withdraw__reaches_backups_that_are_given(db, dest, tmp_path):
     _done("backup", db.root, dest)
+    other = tmp_path / "other.json"  # of another subject
+    other.touch()
+    call = ("withdraw", db.root, SUBJECT, "--yes", "--report", other)
+    assert "a report is not replaced" in _refused(*call)
     lines = _done(
         "withdraw",
         db.root,

@@ -23,7 +23,7 @@ from skindb.cli.options import (
 )
 from skindb.cli.shared import cluster, emit, existing, require_folder, shared_path
 from skindb.cli.terminal import bar, confirm, echo
-from skindb.errors import few_names, input_error
+from skindb.errors import few_names, input_error, require
 from skindb.files import Json
 
 if TYPE_CHECKING:
@@ -229,6 +229,14 @@ def withdraw(
     plan = workflow.plan_withdrawal(database, subject, backups=backups)
     if report is not None:
         require_folder(report)
+        file = workflow.erasure_report_file(report)
+        require(
+            not file.exists(),
+            str(file),
+            "a report is not replaced, as it may be that of another subject",
+            "a file",
+            "choose another name",
+        )
     if dry_run:
         emit(_withdrawal_as_json(plan), _plan_lines(plan))
         return

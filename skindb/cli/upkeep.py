@@ -60,7 +60,10 @@ def info(db: str, where: str | None, release: str | None) -> None:
         superseded = workflow.superseded_calibrations(database)
         result |= {"superseded_calibrations": superseded} if superseded else {}
         lines += workflow.superseded_lines(superseded)
-    emit(result, lines or ["The database holds no takes."])
+    nothing = (
+        "No take is chosen by --where." if where else "The database holds no takes."
+    )
+    emit(result, lines or [nothing])
 
 
 def _info_lines(database: Database, result: Json, *, details: bool) -> list[str]:
@@ -124,8 +127,8 @@ def _version_lines(database: Database, parts: Iterable[tuple[str, Json]]) -> lis
         for kind, version in kinds.items():
             text = version.get("fault")
             if text is None:
-                path = "data/" + version["path"].rpartition("/data/")[2]
-                text = "  ".join([*_cells(version), path])
+                within = version["path"].split("/")[-4:]  # data/KIND/NAME/FILE
+                text = "  ".join([*_cells(version), "/".join(within)])
             if version.get("stale"):
                 text += f"  out of date: {version['stale'][0]}"
             lines.append(f"{name}  {kind}  {text}")

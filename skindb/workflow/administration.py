@@ -355,9 +355,14 @@ def erasure_report(withdrawal: Withdrawal) -> Json:
     return body | {"seal": seal_of(body)}
 
 
+def erasure_report_file(path: Path) -> Path:
+    """File of a report under a path without or with the ending .json."""
+    return path.with_name(f"{path.name.removesuffix('.json')}.json")
+
+
 def write_erasure_report(withdrawal: Withdrawal, path: Path) -> Path:
-    """Write a report as JSON, under a path without or with the ending .json."""
-    file = path.with_name(f"{path.name.removesuffix('.json')}.json")
+    """Write a report as JSON, as `erasure_report_file` of this path."""
+    file = erasure_report_file(path)
     content = json.dumps(erasure_report(withdrawal), indent=1)
     private_file(file).write_text(f"{content}\n", encoding="utf-8")
     return file

@@ -1,6 +1,7 @@
 """From a folder of pictures to maps and a page, without a database."""
 
 import json
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -86,6 +87,14 @@ def quick(
         str(out),
         "results must not be among the pictures",
         "the folder of the pictures",
+        "name another folder",
+    )
+    place = next(one for one in (out, *out.absolute().parents) if one.exists())
+    require(
+        place.is_dir() and os.access(place, os.W_OK | os.X_OK),
+        str(out),
+        "must be a folder that can be written",
+        f"{place}, which is a file or cannot be written",
         "name another folder",
     )
     known = asdict(QuickParameters(**parameters))

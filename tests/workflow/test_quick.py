@@ -77,6 +77,8 @@ def test_quick_writes_maps_and_a_page(pictures: Path, tmp_path: Path) -> None:
     assert "results are not replaced" in again.stderr
     among = run("quick", pictures, pictures, "--no-progress")
     assert "results must not be among the pictures" in among.stderr
+    on_file = run("quick", pictures, out / "page.html" / "a", "--no-progress")
+    assert "must be a folder that can be written" in on_file.stderr
 
 
 def test_three_lights_are_enough(tmp_path: Path) -> None:
