@@ -257,13 +257,17 @@ class Painter {
   }
 
   // Light under the skin of a side as a texture. Sides with equal shape and translucency share it, and it stays the
-  // same while only the view turns.
+  // same while only the view turns; while something moves, it may be that of the frame before.
   glow(name, uniforms, { lights, coarse }, state) {
     const { values } = this.sides[name], shares = ["position", "normal", "diffusion"].every((one) => values[one] === this.face[one]);
     const side = this.sides[shares ? "plain" : name], size = coarse ? COARSE_GLOW_SIZE : GLOW_SIZE;
     const lit = JSON.stringify([lights.map(({ inputs, ...rest }) => rest), state.softness, this.sky]);
-    if (side.glow.lit !== lit || side.glow.size < size) this.drawGlow(side, uniforms, size);
-    side.glow = { lit, size: Math.max(size, side.glow.lit === lit ? side.glow.size : 0), texture: side.blurred.texture };
+    const current = side.glow.lit === lit && side.glow.size >= size;
+    if (current || (coarse && side.glow.drawnLast)) side.glow.drawnLast = false;
+    else {
+      this.drawGlow(side, uniforms, size);
+      side.glow = { lit, size, texture: side.blurred.texture, drawnLast: coarse };
+    }
     return side.glow.texture;
   }
 
