@@ -13,10 +13,11 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile -m "not slow"
 
-# every test and what pages state (the schema, words, the README's commands, with `make demo`), then the commands
+# what pages state (the schema, words, the README's commands, with `make demo`), every test, then the commands
 # of the other pages, the notebooks and the site
 test-all: $(STAMP)
-	$(MAKE) --jobs 3 --output-sync=target readme pages suite
+	$(MAKE) --jobs 2 --output-sync=target readme pages
+	$(MAKE) suite
 	$(MAKE) --jobs 2 --output-sync=target commands notebooks
 
 suite: $(STAMP)
