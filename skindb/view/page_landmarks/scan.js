@@ -84,17 +84,13 @@ class ScanPainter {
     this.programs = { scan: compile(gl, "scan"), mark: compile(gl, "mark") };
     this.surface = gl.createVertexArray();
     gl.bindVertexArray(this.surface);
-    buffer(gl, 0, 3, gl.FLOAT, this.mesh.position);
-    buffer(gl, 1, 3, gl.FLOAT, this.mesh.normal);
-    if (this.mesh.colour) {
-      buffer(gl, 2, 3, gl.UNSIGNED_BYTE, this.mesh.colour);
-      gl.vertexAttribPointer(2, 3, gl.UNSIGNED_BYTE, true, 0, 0);
-    }
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, this.mesh.triangles, gl.STATIC_DRAW);
+    buffer(gl, 0, 3, this.mesh.position);
+    buffer(gl, 1, 3, this.mesh.normal);
+    if (this.mesh.colour) buffer(gl, 2, 3, Float32Array.from(this.mesh.colour, (value) => value / 255));
+    this.triangles = indices(gl, this.mesh.triangles);
     this.marks = gl.createVertexArray();
     gl.bindVertexArray(this.marks);
-    this.places = buffer(gl, 0, 3, gl.FLOAT, new Float32Array(3));
+    this.places = buffer(gl, 0, 3, new Float32Array(3));
     gl.bindVertexArray(null);
   }
 
@@ -110,17 +106,17 @@ class ScanPainter {
     const { eye, up } = frame(view), near = view.distance / 50, far = view.distance + 4 * view.size;
     const matrix = product(perspective(TANGENT, width / height, near, far), lookAt(eye, view.target, [0, 1, 0]));
     setUniforms(gl, this.programs.scan, {
-      matrix: ["mat4", matrix], eye: ["3fv", eye], up: ["3fv", up], low: ["3fv", box.low], high: ["3fv", box.high],
+      matrix: ["Matrix4fv", matrix], eye: ["3fv", eye], up: ["3fv", up], low: ["3fv", box.low], high: ["3fv", box.high],
       coloured: ["1i", coloured && this.mesh.colour ? 1 : 0],
     });
     gl.bindVertexArray(this.surface);
-    gl.drawElements(gl.TRIANGLES, this.mesh.triangles.length, gl.UNSIGNED_INT, 0);
+    drawIndices(gl, gl.TRIANGLES, this.triangles);
     gl.bindVertexArray(this.marks);
     for (const { points, colour, size } of marks) {
       gl.bindBuffer(gl.ARRAY_BUFFER, this.places);
       gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(points.flat()), gl.DYNAMIC_DRAW);
       setUniforms(gl, this.programs.mark, {
-        matrix: ["mat4", matrix], eye: ["3fv", eye], colour: ["3fv", colour], size: ["1f", size * ratio],
+        matrix: ["Matrix4fv", matrix], eye: ["3fv", eye], colour: ["3fv", colour], size: ["1f", size * ratio],
         lift: ["1f", view.distance / 200],
       });
       gl.drawArrays(gl.POINTS, 0, points.length);
