@@ -184,7 +184,7 @@ def main(
     results: dict[str, dict[str, dict[str, float]]] = {}
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "db"
-        fill(skindb.open(str(folder)), takes)
+        fill(skindb.open(str(folder), create=True), takes)
         results["folder"] = dict(measure(str(folder), repeat, []))
         for delay in delay_ms:
             with bucket_of(folder, delay / 1000) as (url, requests):

@@ -802,7 +802,7 @@ def main(
         report(f"head of {len(hero.vertices):,} vertices")
         write_capture(folder, hero, close_dome(lights, cameras, pixel))
         report("photographs")
-    db = skindb.open(out / "db")
+    db = skindb.open(out / "db", create=True)
     workflow.ingest_take(db, folder, spacing_mm=spacing)
     report("ingest")
     held_out = FitParameters(hold_out_lights=(KEPT + 0.5) / lights)

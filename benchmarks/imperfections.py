@@ -180,7 +180,7 @@ def main(
     json_: Annotated[Path | None, "File for all results."] = None,
 ) -> None:
     """Measure and print."""
-    db = skindb.open(db)
+    db = skindb.open(db, create=True)
     results = []
     if refinement:
         print(header(*REFINEMENT_COLUMNS))

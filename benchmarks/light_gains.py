@@ -52,7 +52,7 @@ def planted(capture: xr.DataTree, gain: np.ndarray[Any, Any]) -> xr.DataTree:
 
 def main(db: str, captures: Sequence[Path]) -> None:
     """Measure and print."""
-    database = skindb.open(db)
+    database = skindb.open(db, create=True)
     print(header(*COLUMNS))
     for folder in captures:
         take = ingest_take(database, folder, calibration="note").take

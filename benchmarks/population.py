@@ -115,7 +115,7 @@ def copy(root: Path, record: Record, take: str, changes: dict[str, Any]) -> Reco
 
 def grow(source: Database, take: str, root: Path, takes: int) -> None:
     """Make the takes that the database does not have yet."""
-    target = skindb.open(root)
+    target = skindb.open(root, create=True)
     first = (
         seed(source, take, target)
         if not target.takes("capture")

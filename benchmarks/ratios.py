@@ -96,7 +96,7 @@ class Bench:
         path = self.folder / "db"
         if not path.exists():
             size = {"cameras": 4, "lights": 16, "width": 120, "height": 150}
-            db = skindb.open(path)
+            db = skindb.open(path, create=True)
             for capture in self.captures("takes", TAKES, **size):
                 ingest_take(db, capture, spacing_mm=4.0)
             shutil.copytree(path, self.folder / "captures-only")
@@ -325,7 +325,7 @@ def storing(bench: Bench) -> list[Row]:
     groups = groups_of(model)
     index = np.arange(SURFELS) % groups["fitted"].sizes["surfel"]
     groups["fitted"] = groups["fitted"].isel(surfel=index)
-    db = skindb.open(bench.folder / "large")
+    db = skindb.open(bench.folder / "large", create=True)
     with db.stage("model", "A1") as stage:
         stage.write(groups)
         record = stage.commit({"take": "A1"})
@@ -347,7 +347,7 @@ def studying(bench: Bench) -> list[Row]:
     """CPU time of the albedo study and of the maps that it needs."""
     source = skindb.open(bench.database())
     path = bench.folder / "cohort"
-    target = skindb.open(path)
+    target = skindb.open(path, create=True)
     grow(source, target, STUDY_TAKES, 0)
     register_takes(target)
     study(target, "albedo", takes=target.takes("model")[:2])  # compiles

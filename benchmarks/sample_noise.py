@@ -81,7 +81,7 @@ def expose_again(
 
 
 def ingested(database: Path, capture: Path) -> xr.Dataset:
-    db = skindb.open(str(database))
+    db = skindb.open(str(database), create=True)
     workflow.ingest_take(db, capture)
     return lumitexels(db.read("capture", db.takes("capture")[0]))
 

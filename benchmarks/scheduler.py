@@ -193,7 +193,7 @@ def run(client: Client, scheduler: int, db: skindb.Database) -> dict[str, float]
 def main(*, takes: int = 1000, workers: int = 2, out: Path | None = None) -> int:
     """Measure, print and compare with the limits."""
     with tempfile.TemporaryDirectory() as temporary:
-        db = skindb.open(f"{temporary}/db")
+        db = skindb.open(f"{temporary}/db", create=True)
         fill(db, takes)
         with (
             cluster(Path(temporary), workers) as (address, scheduler),

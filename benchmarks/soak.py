@@ -306,7 +306,7 @@ def main(
     """Run all steps, print the tables, and write the results."""
     out.mkdir(parents=True, exist_ok=True)
     size = {"lights": lights, "cameras": cameras, "width": width, "height": height}
-    db = skindb.open(str(out.absolute() / "db"))
+    db = skindb.open(str(out.absolute() / "db"), create=True)
     with (
         Watch() as watch,
         workflow.connected(scheduler) if scheduler else nullcontext() as client,

@@ -141,7 +141,7 @@ def main(
         return
     grow(
         skindb.open(db),
-        skindb.open(str(work)),
+        skindb.open(str(work), create=True),
         max(takes),
         subdivide,
     )

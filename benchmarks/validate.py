@@ -87,7 +87,7 @@ def measure(
     databases: Path, folder: Path, *, spacing: float, parameters: FitParameters
 ) -> dict[str, Any]:
     """Ingest, fit and compare one capture."""
-    db = skindb.open(databases / folder.name)
+    db = skindb.open(databases / folder.name, create=True)
     with Stages() as ingest:
         if not db.takes("capture"):
             ingest_take(db, folder, spacing_mm=spacing, progress=ingest)

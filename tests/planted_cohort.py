@@ -63,7 +63,7 @@ def capture(take: str, person: dict[str, Any], seed: int) -> Any:
 
 def database(root: Path, people: dict[str, dict[str, Any]]) -> Database:
     """Database of the fitted captures of these subjects."""
-    db = skindb.open(str(root / "db"))
+    db = skindb.open(str(root / "db"), create=True)
     for seed, (take, person) in enumerate(people.items()):
         tree = capture(take, person, seed)
         with db.stage("capture", take) as stage:

@@ -216,7 +216,7 @@ def test_actor__is_that_of_the_option_or_the_environment_or_the_user(
 def test_ingest__of_each_capture_is_an_entry(tmp_path):
     size = ("--cameras", "3", "--lights", "12", "--width", "48", "--height", "60")
     assert _run("simulate", str(tmp_path / "c"), "--takes", "2", *size).returncode == 0
-    db = skindb.open(str(tmp_path / "db"))
+    db = skindb.open(str(tmp_path / "db"), create=True)
     takes = [str(tmp_path / "c" / take) for take in ("V001", "V001.lotion")]
     (tmp_path / "c" / "broken").mkdir()
     (tmp_path / "c" / "broken" / "capture.json").write_text("[")

@@ -25,7 +25,6 @@ import xarray as xr
 from dask.delayed import delayed
 from threadpoolctl import threadpool_limits
 
-import skindb
 from skindb.fit import (
     FitParameters,
     estimate_diffuse_reflectance,
@@ -41,6 +40,7 @@ from skindb.reflectance.kinds import surface_model
 from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.model import Comparison, Judgement
 from skindb.schema import dataset
+from skindb.store import Database
 from skindb.workflow import ingest_take
 from skindb.workflow.fit import fit_take
 
@@ -164,4 +164,4 @@ if __name__ == "__main__":
         print(__doc__)
         sys.exit(0 if "--help" in sys.argv else 2)
     action, folder, name = sys.argv[1:]
-    print(json.dumps(ACTIONS[action](skindb.open(folder), name)))
+    print(json.dumps(ACTIONS[action](Database(folder), name)))

@@ -200,7 +200,7 @@ def ingest(
     low, high = (crop_box[:3], crop_box[3:]) if crop_box else (None, None)
     crop = skindb.ingest.Crop(low, high, crop_reach) if crop_box or crop_reach else None
     progress = bar()
-    database = skindb.open(db)
+    database = skindb.open(db, create=True)
     folders = [shared_path(folder) for folder in captures]
     call = partial(
         workflow.ingest_if_changed,

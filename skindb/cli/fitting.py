@@ -28,7 +28,6 @@ from skindb.cli.shared import (
     choice_lines,
     each_take,
     emit,
-    existing,
     indented,
     shared_path,
     summary_of,
@@ -79,7 +78,7 @@ def fit(
     model keeps the parameters of this model, except those given here. A take that fails
     does not stop the others. The same command resumes an interrupted run.
     """
-    database = existing(db)
+    database = skindb.open(db)
     progress = bar()
     dictionary = shared_path(dictionary)
     # its faults are reported once, before the fits start

@@ -7,7 +7,7 @@ import click
 import skindb
 from skindb import workflow
 from skindb.cli.options import DB, PATH, PORT, command, options_of
-from skindb.cli.shared import aligned, emit, existing, indented, serve, writable
+from skindb.cli.shared import aligned, emit, indented, serve, writable
 from skindb.cli.terminal import bar, wait_for_enter
 from skindb.files import Json
 from skindb.parameters import CalibrationParameters, SessionParameters
@@ -142,7 +142,7 @@ def calibrate(
     versions are kept.
     """
     if from_takes:
-        database = existing(db)
+        database = skindb.open(db)
         default = CalibrationParameters(parameters.name)
         if parameters != default:
             raise click.UsageError(
@@ -156,7 +156,7 @@ def calibrate(
     else:
         if len(sources) != 1:
             raise click.UsageError("give one SETUP, or --from-takes")
-        database = skindb.open(db)
+        database = skindb.open(db, create=True)
         record = workflow.calibrate(database, sources[0], **vars(parameters))
         report = workflow.describe_calibration(database, record)
         lines = _calibration_lines(report)

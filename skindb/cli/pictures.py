@@ -25,7 +25,6 @@ from skindb.cli.shared import (
     chosen_takes,
     each_take,
     emit,
-    existing,
     require_one_take,
     serve,
     shared_path,
@@ -81,7 +80,7 @@ def render(
 
     By default all models are rendered with all lights of the dome and its most frontal camera.
     """
-    database = existing(db)
+    database = skindb.open(db)
     chosen = chosen_takes(database, takes, "edit" if edited else "model")
     written = turntable or out
     if written is None or (turntable and out):
@@ -147,7 +146,7 @@ def compare(
     over that of the photograph without its noise, for each photograph that ingest kept.
     """
     comparisons = workflow.compare_take(
-        existing(db), take, generation=generation, **vars(parameters)
+        skindb.open(db), take, generation=generation, **vars(parameters)
     )
     if out:
         skindb.render.write_comparisons(comparisons, out)
@@ -180,7 +179,7 @@ def show(db: str, take: str, variable: str, out: Path, at: tuple[str, ...]) -> N
     """
     writable(out, ".png", ".pdf", ".svg")
     report = workflow.show_take(
-        existing(db), take, variable, out, at=dict(map(_label, at))
+        skindb.open(db), take, variable, out, at=dict(map(_label, at))
     )
     emit(report, [report["path"]])
 
@@ -213,7 +212,7 @@ def export(
     with OpenPBR, a program for Mitsuba 3, manifest.json and a README.txt that describes
     each file and its measured error.
     """
-    database = existing(db)
+    database = skindb.open(db)
     progress = bar()
     chosen = chosen_takes(database, takes, "edit" if edited else "model")
     if parameters.gltf and out.suffix:
@@ -292,7 +291,7 @@ def view(
         "0",
         "give, for example, age=20",
     )
-    database = existing(db)
+    database = skindb.open(db)
     chosen = chosen_takes(database, takes, "model")
     if explain:
         with workflow.logged_action(database, "view", chosen, explain=True):

@@ -24,7 +24,6 @@ from skindb.cli.shared import (
     aligned,
     cluster,
     emit,
-    existing,
     indented,
     trait_amounts,
     writable,
@@ -61,7 +60,7 @@ def register(
 
     The report says how well the landmarks agree.
     """
-    database = existing(db)
+    database = skindb.open(db)
     progress = bar()
     with cluster() as client:
         records = workflow.register_takes(
@@ -115,7 +114,7 @@ def edit(db: str, take: str, grid: Path | None, parameters: EditParameters) -> N
     `render` and `export` use it with --edited.
     """
     amounts = trait_amounts(parameters.traits)
-    database = existing(db)
+    database = skindb.open(db)
     options: dict[str, Any] = {
         "study": parameters.study,
         "dictionary": parameters.dictionary,
@@ -197,7 +196,7 @@ def reproduce(db: str, out: Path, take: str | None, dictionary: Path | None) -> 
     What the takes do not allow is named on the page with the reason.
     """
     made = workflow.reproduce(
-        existing(db),
+        skindb.open(db),
         out,
         take=take,
         dictionary=dictionary,

@@ -223,28 +223,6 @@ def fault_lines(faults: Iterable[Fault], *, unlimited: bool) -> list[str]:
     ]
 
 
-def existing(db: str) -> Database:
-    """Open a database, which must exist."""
-    database = skindb.open(db)
-    names = database.names()
-    cure = "ingest a capture into it first"
-    require(names is not None, db, "the database must exist", "nothing", cure)
-    entries = set(names or ())
-    # may exist after a first ingest that was killed
-    begun = {"audit", "data", "leases", "secret", "staging", "tmp"}
-    # a bucket without records has no log
-    has_log = bool({"log", "tombstones", "withdrawn"} & entries)
-    cure = "give the folder of the database"
-    require(
-        has_log or entries <= begun,
-        db,
-        "a database must have a log",
-        "a folder without one",
-        cure,
-    )
-    return database
-
-
 def chosen_takes(
     database: Database, takes: Sequence[str], kind: Literal["model", "edit"]
 ) -> list[str]:

@@ -22,7 +22,7 @@ from skindb.cli.options import (
     common,
     options_of,
 )
-from skindb.cli.shared import aligned, cluster, emit, existing, shared_path, writable
+from skindb.cli.shared import aligned, cluster, emit, shared_path, writable
 from skindb.cli.terminal import HelpContext, bar
 from skindb.errors import input_error
 from skindb.files import Json, csv_text, private_file
@@ -159,7 +159,7 @@ def _run_study(
         chosen[several] = tuple(filter(None, names))
     if "dictionary" in chosen:
         chosen["dictionary"] = shared_path(chosen["dictionary"])
-    database = existing(click.get_current_context().obj)
+    database = skindb.open(click.get_current_context().obj)
     progress = bar()
     progress(f"analyze {study.name}", 0, 1)
     studied = takes or database.takes("model", release=release)
@@ -258,7 +258,7 @@ def tidy(db: str, takes: tuple[str, ...], release: str | None, out: Path) -> Non
     condition, visit and repeat, and the attributes of the captures.
     """
     writable(out, ".csv", ".parquet")
-    database = existing(db)
+    database = skindb.open(db)
     table, skipped, spacing = workflow.tidy_table(
         database, takes=takes, release=release
     )

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+import skindb
 from skindb import workflow
 from skindb.cli.options import (
     DB,
@@ -21,7 +22,7 @@ from skindb.cli.options import (
     asked,
     command,
 )
-from skindb.cli.shared import cluster, emit, existing, require_folder, shared_path
+from skindb.cli.shared import cluster, emit, require_folder, shared_path
 from skindb.cli.terminal import bar, confirm, echo
 from skindb.errors import few_names, input_error, require
 from skindb.files import Json
@@ -49,7 +50,7 @@ def consent(db: str, subject: str, scope: str | None) -> None:
     allows ingest and fit; statistics allows analyze, register and edit; export allows
     render, compare, show, view and export; publish labels exports.
     """
-    database = existing(db)
+    database = skindb.open(db)
     if scope is not None:
         names = [name for part in scope.split(",") if (name := part.strip())]
         if not names or ("none" in names and len(names) > 1):
@@ -86,7 +87,7 @@ def release(
     listed. Studies and cohorts of a release give the same values, whatever is fitted
     later.
     """
-    database = existing(db)
+    database = skindb.open(db)
     if name is not None:
         chosen = list(takes) or database.takes("model")
         if where is not None:
@@ -135,7 +136,7 @@ def refresh(
     one of its inputs was superseded or withdrawn, or when a subject no longer consents
     to statistics. Each result is computed again with its own parameters.
     """
-    database = existing(db)
+    database = skindb.open(db)
     progress = bar()
     if dry_run:
         results = workflow.stale_results(database)
@@ -225,7 +226,7 @@ def withdraw(
     back. Pictures and exports that were written earlier, and backups that are not
     given, are not reached.
     """
-    database = existing(db)
+    database = skindb.open(db)
     plan = workflow.plan_withdrawal(database, subject, backups=backups)
     if report is not None:
         require_folder(report)

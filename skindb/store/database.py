@@ -59,6 +59,9 @@ from skindb.store.stage import Stage, read_tables
 from skindb.store.stale import Request, read_requests
 from skindb.store.verify import database_faults
 
+# names at the top level that may exist after a first ingest that was killed
+BEGUN = {"audit", "data", "leases", "secret", "staging", "tmp"}
+
 
 class Database:
     """A database of versions; the object holds no state except its location.
@@ -635,17 +638,48 @@ class Database:
         return remove_garbage(self.place, generations)
 
 
-def open(url: str) -> Database:  # noqa: A001  as in xarray and zarr
+def open(  # noqa: A001  as in xarray and zarr
+    url: str | os.PathLike[str], *, create: bool = False
+) -> Database:
     """Open a database.
 
     Parameters
     ----------
     url
         See `Database`.
+    create
+        Whether the database may be absent; its first commit then creates it.
 
     Returns
     -------
     Database
         With `takes()`, `table()`, `read(kind, take)`, `cohort(layout)` and `info()`.
+
+    Raises
+    ------
+    InputError
+        If there is no database, unless `create` is set.
     """
-    return Database(url)
+    db = Database(url)
+    if create:
+        return db
+    names = db.names()
+    require(
+        names is not None,
+        db.url,
+        "the database must exist",
+        "nothing",
+        "correct the path, or create it: skindb ingest, or "
+        "skindb.open(..., create=True) in Python",
+    )
+    entries = set(names or ())
+    # a bucket without records has no log
+    has_log = bool(entries & {"log", "tombstones", "withdrawn"})
+    require(
+        has_log or entries <= BEGUN,
+        db.url,
+        "a database must have a log",
+        "a folder without one",
+        "give the folder of the database",
+    )
+    return db

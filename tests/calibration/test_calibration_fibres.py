@@ -189,7 +189,7 @@ def test_calibrate_probe__finds_centres_and_gains(laboratory):
 
 
 def test_ingest__takes_the_gains_of_the_named_calibration(laboratory, tmp_path):
-    db = skindb.open(str(tmp_path / "db"))
+    db = skindb.open(str(tmp_path / "db"), create=True)
     meta = json.loads((laboratory / "capture.json").read_text()) | {
         "version": 2,
         "calibration": "lab",

@@ -85,7 +85,7 @@ def database(root: Path) -> None:
     the second was removed.
     """
     size = {"cameras": 3, "lights": 12, "width": 48, "height": 60}
-    db = skindb.open(str(root))
+    db = skindb.open(str(root), create=True)
     for folder in workflow.simulate(root.parent / "captures", takes=2, **size):
         workflow.ingest_take(db, folder, spacing_mm=8.0, photographs=1)
     workflow.fit_take(
@@ -111,7 +111,7 @@ def read_all(
     near = {kind for kind, _, _ in versions if f"/{kind}" in damage} or {
         kind for kind, _, _ in versions
     }
-    db = skindb.open(str(root))
+    db = skindb.open(str(root), create=True)
     found = {}
     faults = []
 
@@ -261,8 +261,8 @@ def attempt(
 ) -> apart.Outcome:
     """Verify and read the database, and compare."""
     with dask.config.set(scheduler="synchronous"):
-        named = skindb.open(str(root)).verify()
-        skindb.open(str(root)).garbage()  # with any damage
+        named = skindb.open(str(root), create=True).verify()
+        skindb.open(str(root), create=True).garbage()  # with any damage
         found, refused = read_all(root, true["versions"], what)
         told = command_faults(root, number // 4) if number % 4 == 0 else []
     changed = differences(found, true["numbers"])

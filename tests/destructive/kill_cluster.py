@@ -192,7 +192,7 @@ def started_cluster(folder: Path) -> Iterator[Cluster]:
 
 def prepare(root: Path) -> None:
     """A database of captures, one a subject."""
-    db = skindb.open(str(root))
+    db = skindb.open(str(root), create=True)
     for number in range(TAKES):
         take = f"S{number:02d}"
         tree = capture(

@@ -138,7 +138,7 @@ def kill(variant: str, folder: Path, asked: argparse.Namespace) -> list[apart.Ca
         if variant == "fit":
             database(folder, {TAKE: PEOPLE[TAKE]})
         else:
-            write_small(skindb.open(str(whole)))
+            write_small(skindb.open(str(whole), create=True))
 
     def count() -> None:
         db = skindb.open(str(shutil.copytree(whole, folder / "counted")))

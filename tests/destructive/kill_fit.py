@@ -157,7 +157,7 @@ def prepare(folder: Path, sources: Mapping[str, str]) -> None:
     and with nothing but a folder.
     """
     for name in ("fit", "refit"):
-        db = skindb.open(sources[name])
+        db = skindb.open(sources[name], create=True)
         tree = capture(FIT_TAKE, PEOPLE[FIT_TAKE], 0)
         with db.stage("capture", FIT_TAKE) as stage:
             stage.write(groups_of(tree))
@@ -178,7 +178,7 @@ def copied(source: Path, source_url: str, work: Path, new_url: NewUrl) -> str:
         shutil.copytree(source, work)
     if url.startswith("s3://"):
         apart.in_a_process(
-            lambda: copy_objects(skindb.open(source_url), skindb.open(url))
+            lambda: copy_objects(skindb.open(source_url), skindb.open(url, create=True))
         )
     return url
 
@@ -187,7 +187,7 @@ def measure(work: Path, url: str, variant: str, known_at: Path) -> None:
     """Run without a kill, and return the seconds of each stage and the files of the version."""
     compiled: list[bool] = []
     for _ in range(2):
-        db = skindb.open(url)
+        db = skindb.open(url, create=True)
         marks = [(STAGES[variant][0], time.monotonic())]
         with reported_compilation(lambda: compiled.append(True)):
             WORK[variant](
@@ -235,7 +235,7 @@ def attempt(
         work, url, variant, stage, part * known["seconds"].get(stage, 0.0)
     )
     # not before: threads of a client of a bucket must not be forked
-    db = skindb.open(url)
+    db = skindb.open(url, create=True)
     first = has_first_pass(db, take)
     before = known["before"]
     there = generations(db, kind, take)
@@ -330,7 +330,7 @@ def killed_within(
             os.close(pipe)
             tell = lambda name: os.write(end, f"{name}\n".encode())  # noqa: E731
             tell(STAGES[variant][0])
-            WORK[variant](skindb.open(url), tell, work)
+            WORK[variant](skindb.open(url, create=True), tell, work)
             tell("done")
         os._exit(0)
     os.close(end)

@@ -399,7 +399,7 @@ def main() -> None:
                 else str(folder / f"case {number}")
             )
             _seconds(
-                lambda: copy_objects(Database(first), skindb.open(url)),
+                lambda: copy_objects(Database(first), skindb.open(url, create=True)),
                 folder / "copy.log",
             )
             return url

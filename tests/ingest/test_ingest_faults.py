@@ -229,7 +229,7 @@ def test_sample_noise__is_unknown_without_electrons(capture_folder, tmp_path):
 
 
 def _samples(tmp_path, name, folder):
-    db = skindb.open(str(tmp_path / name))
+    db = skindb.open(str(tmp_path / name), create=True)
     workflow.ingest_take(db, folder)
     return lumitexels(db.read("capture", "T001")).load()
 

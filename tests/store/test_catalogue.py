@@ -141,9 +141,10 @@ def test_table__of_a_bucket_needs_as_many_requests_for_many_takes_as_for_few(
         counts = []
         for take in ("A1", "B2", "C3", "D4"):
             commit(bucket, take=take, **SCOPE)
-            skindb.open(bucket).table()
+            db = skindb.open(bucket)
+            db.table()
             proxy.requests.clear()
-            assert take in skindb.open(bucket).takes(where="capture_generation == 1")
+            assert take in db.takes(where="capture_generation == 1")
             counts.append(len(proxy.requests))
     # the log, the heads, the withdrawals, the list of blocks of the cache, and the blocks
     takes = ("A1", "B2", "C3", "D4")

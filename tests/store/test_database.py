@@ -606,3 +606,15 @@ def test_database__opens_while_another_process_creates_the_folder(
         patch.setattr(Path, query, then_created)
         db = Database(root)
     assert db.takes("capture") == []
+
+
+def test_open__a_database_that_is_not_there_is_refused(tmp_path):
+    url = str(tmp_path / "typo")
+    with pytest.raises(
+        InputError, match=r"typo: the database must exist; found nothing; .*create=True"
+    ):
+        skindb.open(url)
+    db = skindb.open(url, create=True)
+    assert not (tmp_path / "typo").exists()
+    commit(db.root)
+    assert skindb.open(url).takes() == ["A1"]

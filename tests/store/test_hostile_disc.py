@@ -251,7 +251,7 @@ def test_lease__of_a_machine_whose_clock_is_an_hour_off(
     tmp_path, clock, monkeypatch, hours
 ):
     """That machine holds a lease and has left a version; files have the time of the storage."""
-    db = skindb.open(str(tmp_path / "db"))
+    db = skindb.open(str(tmp_path / "db"), create=True)
     commit(db.root)
     with monkeypatch.context() as other:
         other.setattr(

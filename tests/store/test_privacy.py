@@ -38,7 +38,7 @@ def umask(request):
 
 
 def test_database__belongs_to_its_owner_alone(tmp_path, umask):
-    db = skindb.open(tmp_path / "db")
+    db = skindb.open(tmp_path / "db", create=True)
     _commit(db)
     db.record_consent("S02", ["fit"])
     _commit(db)
@@ -47,7 +47,7 @@ def test_database__belongs_to_its_owner_alone(tmp_path, umask):
 
 def test_database__in_an_empty_folder_is_closed_too(tmp_path, umask):
     (tmp_path / "db").mkdir(mode=0o777)
-    db = skindb.open(tmp_path / "db")
+    db = skindb.open(tmp_path / "db", create=True)
     _commit(db)
     assert _modes(db.root) == ({0o700}, {0o600})
 
@@ -59,14 +59,14 @@ def test_database__leaves_the_permissions_of_a_folder_with_other_things(
     root.mkdir()
     root.chmod(0o755)
     (root / "notes.txt").write_text("mine")
-    db = skindb.open(root)
+    db = skindb.open(root, create=True)
     _commit(db)
     assert root.stat().st_mode & 0o777 == 0o755
     assert _modes(root / "data")[1] == {0o640}
 
 
 def test_database__is_shared_with_a_group_where_its_root_is(tmp_path, umask):
-    db = skindb.open(tmp_path / "db")
+    db = skindb.open(tmp_path / "db", create=True)
     _commit(db)
     for folder in (db.root, db.root / "log", db.root / "data"):
         folder.chmod(0o2770)

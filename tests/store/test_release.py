@@ -98,7 +98,7 @@ def test_release__unknown_names_are_refused(db):
 
 
 def test_release__another_version_of_that_generation_is_refused(tmp_path):
-    db = skindb.open(str(tmp_path / "db"))
+    db = skindb.open(str(tmp_path / "db"), create=True)
     commit(db.root, kind="model")
     db.create_release("first")
     for place in ("log/model/A1/00000001.json", "heads/model/A1.json"):

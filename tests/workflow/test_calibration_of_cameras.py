@@ -210,7 +210,7 @@ def test_ingest__uses_the_calibrated_cameras(linear_setup, pristine, tmp_path):
         "calibration": "dome-a",
     }
     (folder / "capture.json").write_text(json.dumps(meta))
-    db = skindb.open(str(tmp_path / "db"))
+    db = skindb.open(str(tmp_path / "db"), create=True)
     result = CliRunner().invoke(
         cli, ["calibrate", str(db.folder), str(linear_setup), "--name", "dome-a"]
     )
@@ -294,7 +294,7 @@ def test_calibrate_cameras__faults_are_named_in_lines(
     if "chrat" in change:
         del record["chart"]
     file.write_text(json.dumps(record))
-    db = skindb.open(str(tmp_path / "db"))
+    db = skindb.open(str(tmp_path / "db"), create=True)
     with pytest.raises(InputError) as caught:
         workflow.calibrate(db, setup, name="dome-a")
     assert said in str(caught.value)

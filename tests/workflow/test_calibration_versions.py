@@ -52,7 +52,7 @@ def setup(pristine, tmp_path):
 
 
 def test_calibrate__intensities_of_the_made_up_lights(setup, tmp_path):
-    db = skindb.open(str(tmp_path / "db"))
+    db = skindb.open(str(tmp_path / "db"), create=True)
     record = workflow.calibrate(db, setup, name="dome-a")
     found = db.read("calibration", "dome-a")["light_calibration"].to_dataset().load()
     assert found["light"].values.tolist() == list(LIGHTS)
@@ -94,7 +94,7 @@ def test_calibrate_lights__light_beside_the_target_is_part_of_the_error(setup):
 def test_ingest__takes_the_lights_of_the_named_calibration(
     setup, capture, pristine, tmp_path
 ):
-    db = skindb.open(str(tmp_path / "db"))
+    db = skindb.open(str(tmp_path / "db"), create=True)
     with pytest.raises(
         InputError,
         match="must hold the calibration that it names; found dome-a; calibrations: none",
@@ -175,7 +175,7 @@ def test_ingest__takes_the_positions_of_the_named_calibration(setup, capture, tm
     (setup / "dome/calibration.json").write_text(
         json.dumps({"ball": ball, "points": points})
     )
-    db = skindb.open(str(tmp_path / "db"))
+    db = skindb.open(str(tmp_path / "db"), create=True)
     result = CliRunner().invoke(
         cli, ["calibrate", str(db.folder), str(setup), "--name", "dome-a"]
     )
@@ -209,7 +209,7 @@ def test_calibrate__refuses_a_camera_that_does_not_show_known_points_where_they_
     (setup / "dome/calibration.json").write_text(
         json.dumps({"points": {"positions": positions, "pixels": {"c0": pixels}}})
     )
-    db = skindb.open(str(tmp_path / "db"))
+    db = skindb.open(str(tmp_path / "db"), create=True)
     message = (
         r"calibration\.json\[points\], camera c0: known points must be seen within 2 "
         r"px of .* 34 px, \d\d mm"
@@ -220,7 +220,7 @@ def test_calibrate__refuses_a_camera_that_does_not_show_known_points_where_they_
 
 
 def test_calibrate__mistakes(setup, capture, tmp_path):
-    db = skindb.open(str(tmp_path / "db"))
+    db = skindb.open(str(tmp_path / "db"), create=True)
     for name in ("a b", "", "../x"):
         with pytest.raises(InputError, match="name of a calibration"):
             workflow.calibrate(db, setup, name=name)

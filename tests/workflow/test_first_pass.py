@@ -32,7 +32,7 @@ def db(tmp_path):
 
 
 def _database(folder):
-    db = skindb.open(folder / "db")
+    db = skindb.open(folder / "db", create=True)
     _ingest(db)
     return db
 

@@ -22,7 +22,7 @@ def db(bucket, monkeypatch):
     """Takes A, A.lotion, B, C in a bucket."""
     # 8 of the 59
     monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)
-    db = skindb.open(bucket)
+    db = skindb.open(bucket, create=True)
     for take, model in population().items():
         with db.stage("model", take) as stage:
             stage.write(
@@ -35,7 +35,7 @@ def db(bucket, monkeypatch):
 
 
 def test_withdraw__of_the_only_subject_of_a_bucket(bucket):
-    db = skindb.open(bucket)
+    db = skindb.open(bucket, create=True)
     with db.stage("capture", "A") as stage:
         stage.commit({"consent_scope": ["fit"]})
     for command in (

@@ -146,7 +146,7 @@ def test_a_capture_that_is_unchanged_is_not_stored_again(
     capture = tmp_path / "capture"
     consent = {"scope": ["fit"], "reference": "form"}
     import_images(pictures, capture, {"subject": "P1", "consent": consent})
-    db = skindb.open(str(tmp_path / "db"))
+    db = skindb.open(str(tmp_path / "db"), create=True)
     words = ["ingest", tmp_path / "db", capture, "--no-progress", "--spacing"]
 
     def ingested(*more: object) -> tuple[int, bool]:
@@ -198,7 +198,7 @@ def test_wrong_imports_are_one_line(
 def test_relative_and_absolute_reflectance_are_not_mixed(
     pictures: Path, tmp_path: Path
 ) -> None:
-    db = skindb.open(str(tmp_path / "db"))
+    db = skindb.open(str(tmp_path / "db"), create=True)
     for name in ("relative", "absolute"):
         folder = tmp_path / name
         consent = {"scope": ["fit", "statistics"], "reference": "form"}
@@ -226,7 +226,7 @@ def test_relative_and_absolute_reflectance_are_not_mixed(
 def test_takes_of_different_exposures_are_not_mixed(
     pictures: Path, tmp_path: Path
 ) -> None:
-    db = skindb.open(str(tmp_path / "db"))
+    db = skindb.open(str(tmp_path / "db"), create=True)
     for name, exposure in (("short", 0.01), ("same", 0.0101), ("long", 0.02)):
         folder = tmp_path / name
         consent = {"scope": ["fit", "statistics"], "reference": "form"}

@@ -226,7 +226,7 @@ def test_target_faults__names_what_is_wrong(
 def test_calibrate__completes_a_dome_without_geometry(lab, tmp_path):
     for kind, places in (("board", 5), ("white", None), ("ball", 2)):
         record(lab, kind, placements=places)
-    db = skindb.open(str(tmp_path / "db"))
+    db = skindb.open(str(tmp_path / "db"), create=True)
     before = (lab / "dome/dome.json").read_text()
     calibration = json.loads((lab / "dome/calibration.json").read_text())
     ball = calibration.pop("ball")

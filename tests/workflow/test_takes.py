@@ -341,7 +341,7 @@ def dictionary(tmp_path_factory, small_dictionary):
 
 def _filled(root, captures, dictionary, **where):
     """A database of captures, models and registrations."""
-    db = skindb.open(str(root))
+    db = skindb.open(str(root), create=True)
     ingest = partial(workflow.ingest_take, db, spacing_mm=6.0)
     list(results_of(map_takes(ingest, captures, **where)))
     takes = db.takes("capture")[:: -1 if "client" in where else 1]

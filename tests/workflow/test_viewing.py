@@ -27,7 +27,7 @@ PROGRAM = "from skindb.cli import main; main()"
 @pytest.fixture
 def faces(tmp_path):
     """A database of models of two subjects that can be shown."""
-    db = skindb.open(str(tmp_path / "db"))
+    db = skindb.open(str(tmp_path / "db"), create=True)
     for take, age in (("S01", 30), ("S02", 60)):
         tree = small_face()
         about = {

@@ -29,7 +29,7 @@ SMALL = FitParameters(k=2, rank=6)
 
 
 def _commit(folder, capture):
-    db = skindb.open(str(folder))
+    db = skindb.open(str(folder), create=True)
     with db.stage("capture", "S1") as stage:
         stage.write(groups_of(capture))
         stage.commit(capture.attrs)
