@@ -2,6 +2,7 @@
 paths of its frames.
 """
 
+import glob
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
@@ -451,6 +452,17 @@ def promised_frames(dome: DomeRecord) -> Iterator[tuple[str, str, CameraRecord]]
     """Key, path in the folder and camera of every frame the folder must hold."""
     for key, template, names, camera in _views(dome):
         yield key, filled(template, **names), camera
+
+
+def unread_frames(dome: DomeRecord) -> list[str]:
+    """Paths in the folder of files that are named like frames of the face, but by
+    another light, camera or exposure than those of the dome.
+    """
+    anything = dict.fromkeys((EXPOSURE, LIGHT, CAMERA), "*")
+    pattern = filled(glob.escape(dome.frames), **anything)
+    files = map(Path, glob.glob(pattern, root_dir=dome.folder))  # noqa: PTH207
+    promised = {Path(name) for _, name, _ in promised_frames(dome)}
+    return sorted(map(str, {*files} - promised))
 
 
 def _sequence(

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from skindb.errors import Fault, InputError, attempt
+from skindb.errors import Fault, InputError, attempt, few_names
 from skindb.files import Attributes, Json
 from skindb.format.contact_probe import ProbeRecord, read_probe
-from skindb.format.dome import DomeRecord, read_dome
+from skindb.format.dome import DomeRecord, read_dome, unread_frames
 from skindb.format.fields import (
     CURE,
     IDENTIFIER,
@@ -536,6 +536,11 @@ class _Reader:
                 else "intensities of the lights are taken as given"
             )
             self.skipped.append(f"white: not in dome.json; {meaning}")
+        if not self.faults and (unread := unread_frames(dome)):
+            self.skipped.append(
+                f"frames: not read, as dome.json lacks their light, camera or exposure: "
+                f"{few_names(unread, 1)}"
+            )
         if surface is None or self.unit_faults:
             return dome
         file = fields.where

@@ -80,6 +80,8 @@ LARGEST_HEAD = 700.0  # mm, with neck and shoulders
 MAX_MEAN_NORMAL = 0.6
 # distance of the devices over the diagonal of a head; domes of 0.8 m have 2.1 to 2.5
 DOME_RADIUS_RATIO = 2.0
+# of the diagonal of the scan, 8 mm for a head: a dome in metres lies within it
+MIN_DOME_REACH = 0.02
 
 
 def scan_faults(where: str, surface: CleanMesh) -> list[Fault]:
@@ -306,6 +308,13 @@ def device_faults(where: str, dome: DomeRecord, surface: CleanMesh) -> list[Faul
         ("cameras", {camera.id: camera.centre for camera in dome.cameras}),
         ("lights", {light.id: light.position for light in dome.lights}),
     ):
+        reach = lengths([*positions.values()]).max()
+        if len(positions) > 2 and reach < MIN_DOME_REACH * diagonal:
+            rule = "positions must be in mm, and a dome must surround the scan"
+            finding = f"all {len(positions)} within {reach:.2g} mm of the origin"
+            cure = _dome_rescaling([*positions.values()], diagonal)
+            faults.append(Fault(f"{where}[{key}]", rule, finding, cure))
+            continue
         far = [n for n, p in positions.items() if lengths(p) > MAX_DEVICE_DISTANCE_MM]
         inner = [n for n, p in positions.items() if _inside(surface, p)]
         if far:

@@ -674,6 +674,14 @@ def test_read_capture__says_that_intensities_are_taken_as_given(capture_folder):
     )
 
 
+def test_read_capture__says_that_frames_of_a_missing_light_are_not_read(capture_folder):
+    edit(capture_folder / D, lambda dome: dome["lights"].pop())
+    assert (
+        "frames: not read, as dome.json lacks their light, camera or exposure: "
+        "dome/frames/long/l3_c0.png and 3 more"
+    ) in read_capture(capture_folder).skipped
+
+
 def test_read_capture__links_inside_the_folder_are_fine(capture_folder):
     (capture_folder / "real.ply").write_bytes(
         (capture_folder / "scan.ply").read_bytes()

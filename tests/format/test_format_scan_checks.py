@@ -289,14 +289,17 @@ def test_read_capture__camera_inside_the_head(capture_folder):
     ) in fault
 
 
-def test_read_capture__dome_in_metres_puts_all_inside(capture_folder):
+def test_read_capture__lights_in_metres_behind_an_open_scan(capture_folder):
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+    cap = ball.vertices[ball.faces][..., 2].min(axis=1) > RADIUS / 4
+    put_scan(capture_folder, ball.vertices, ball.faces[cap])
     record = dome(capture_folder)
     for light in record["lights"]:
         light["position"] = [x / 1000 for x in light["position"]]
     write(capture_folder, "dome/dome.json", record)
     fault = only_fault(capture_folder)
-    assert "dome.json[lights]: lights must be outside the head; found 4 of 4" in fault
-    assert "these look like metres: multiply by 1000, or calibrate" in fault
+    assert "dome.json[lights]: positions must be in mm" in fault
+    assert "all 4 within 0.5 mm of the origin; these look like metres" in fault
 
 
 def test_read_capture__some_lights_inside_the_head_are_no_unit(capture_folder):
