@@ -78,7 +78,7 @@ def fit(
     model keeps the parameters of this model, except those given here. A take that fails
     does not stop the others. The same command resumes an interrupted run.
     """
-    database = skindb.open(db)
+    database = skindb.open(db, create=False)
     progress = bar()
     dictionary = shared_path(dictionary)
     # its faults are reported once, before the fits start

@@ -142,7 +142,7 @@ def calibrate(
     versions are kept.
     """
     if from_takes:
-        database = skindb.open(db)
+        database = skindb.open(db, create=False)
         default = CalibrationParameters(parameters.name)
         if parameters != default:
             raise click.UsageError(

@@ -80,7 +80,7 @@ def render(
 
     By default all models are rendered with all lights of the dome and its most frontal camera.
     """
-    database = skindb.open(db)
+    database = skindb.open(db, create=False)
     chosen = chosen_takes(database, takes, "edit" if edited else "model")
     written = turntable or out
     if written is None or (turntable and out):
@@ -146,7 +146,7 @@ def compare(
     over that of the photograph without its noise, for each photograph that ingest kept.
     """
     comparisons = workflow.compare_take(
-        skindb.open(db), take, generation=generation, **vars(parameters)
+        skindb.open(db, create=False), take, generation=generation, **vars(parameters)
     )
     if out:
         skindb.render.write_comparisons(comparisons, out)
@@ -179,7 +179,7 @@ def show(db: str, take: str, variable: str, out: Path, at: tuple[str, ...]) -> N
     """
     writable(out, ".png", ".pdf", ".svg")
     report = workflow.show_take(
-        skindb.open(db), take, variable, out, at=dict(map(_label, at))
+        skindb.open(db, create=False), take, variable, out, at=dict(map(_label, at))
     )
     emit(report, [report["path"]])
 
@@ -212,7 +212,7 @@ def export(
     with OpenPBR, a program for Mitsuba 3, manifest.json and a README.txt that describes
     each file and its measured error.
     """
-    database = skindb.open(db)
+    database = skindb.open(db, create=False)
     progress = bar()
     chosen = chosen_takes(database, takes, "edit" if edited else "model")
     if parameters.gltf and out.suffix:
@@ -291,7 +291,7 @@ def view(
         "0",
         "give, for example, age=20",
     )
-    database = skindb.open(db)
+    database = skindb.open(db, create=False)
     chosen = chosen_takes(database, takes, "model")
     if explain:
         with workflow.logged_action(database, "view", chosen, explain=True):

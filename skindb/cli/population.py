@@ -60,7 +60,7 @@ def register(
 
     The report says how well the landmarks agree.
     """
-    database = skindb.open(db)
+    database = skindb.open(db, create=False)
     progress = bar()
     with cluster() as client:
         records = workflow.register_takes(
@@ -114,7 +114,7 @@ def edit(db: str, take: str, grid: Path | None, parameters: EditParameters) -> N
     `render` and `export` use it with --edited.
     """
     amounts = trait_amounts(parameters.traits)
-    database = skindb.open(db)
+    database = skindb.open(db, create=False)
     options: dict[str, Any] = {
         "study": parameters.study,
         "dictionary": parameters.dictionary,
@@ -196,7 +196,7 @@ def reproduce(db: str, out: Path, take: str | None, dictionary: Path | None) -> 
     What the takes do not allow is named on the page with the reason.
     """
     made = workflow.reproduce(
-        skindb.open(db),
+        skindb.open(db, create=False),
         out,
         take=take,
         dictionary=dictionary,

@@ -159,7 +159,7 @@ def _run_study(
         chosen[several] = tuple(filter(None, names))
     if "dictionary" in chosen:
         chosen["dictionary"] = shared_path(chosen["dictionary"])
-    database = skindb.open(click.get_current_context().obj)
+    database = skindb.open(click.get_current_context().obj, create=False)
     progress = bar()
     progress(f"analyze {study.name}", 0, 1)
     studied = takes or database.takes("model", release=release)
@@ -258,7 +258,7 @@ def tidy(db: str, takes: tuple[str, ...], release: str | None, out: Path) -> Non
     condition, visit and repeat, and the attributes of the captures.
     """
     writable(out, ".csv", ".parquet")
-    database = skindb.open(db)
+    database = skindb.open(db, create=False)
     table, skipped, spacing = workflow.tidy_table(
         database, takes=takes, release=release
     )

@@ -50,7 +50,7 @@ def consent(db: str, subject: str, scope: str | None) -> None:
     allows ingest and fit; statistics allows analyze, register and edit; export allows
     render, compare, show, view and export; publish labels exports.
     """
-    database = skindb.open(db)
+    database = skindb.open(db, create=False)
     if scope is not None:
         names = [name for part in scope.split(",") if (name := part.strip())]
         if not names or ("none" in names and len(names) > 1):
@@ -87,7 +87,7 @@ def release(
     listed. Studies and cohorts of a release give the same values, whatever is fitted
     later.
     """
-    database = skindb.open(db)
+    database = skindb.open(db, create=False)
     if name is not None:
         chosen = list(takes) or database.takes("model")
         if where is not None:
@@ -136,7 +136,7 @@ def refresh(
     one of its inputs was superseded or withdrawn, or when a subject no longer consents
     to statistics. Each result is computed again with its own parameters.
     """
-    database = skindb.open(db)
+    database = skindb.open(db, create=False)
     progress = bar()
     if dry_run:
         results = workflow.stale_results(database)
@@ -226,7 +226,7 @@ def withdraw(
     back. Pictures and exports that were written earlier, and backups that are not
     given, are not reached.
     """
-    database = skindb.open(db)
+    database = skindb.open(db, create=False)
     plan = workflow.plan_withdrawal(database, subject, backups=backups)
     if report is not None:
         require_folder(report)

@@ -43,7 +43,7 @@ def info(db: str, where: str | None, release: str | None) -> None:
     capture_created, model_created, consent. Comparisons are combined by and, or, not;
     there are also in ['a', 'b'] and is missing. Text and dates stand in quotes.
     """
-    database = skindb.open(db)
+    database = skindb.open(db, create=False)
     of_release = None
     if release is not None:
         kinds = ("capture", "model")
@@ -194,7 +194,7 @@ def verify(db: str) -> None:
     Results that are out of date are no damage, see skindb refresh --dry-run, and neither is
     garbage, see skindb clean.
     """
-    faults = skindb.open(db).verify()
+    faults = skindb.open(db, create=False).verify()
     emit({}, [] if faults else ["Every version is intact."], faults)
 
 
@@ -209,7 +209,7 @@ def audit(db: str, subject: str | None) -> None:
 
     Entries that are missing, changed or in another order are faults.
     """
-    entries, faults = skindb.open(db).audit(subject=subject)
+    entries, faults = skindb.open(db, create=False).audit(subject=subject)
     header = ["number", "when", "actor", "action", "subjects", "counts", "parameters"]
     rows = [
         [
@@ -253,7 +253,7 @@ def clean(db: str, generations: int | None, yes: bool) -> None:
     unless the process that wrote them has ended. Files from which an interrupted run
     can resume are kept for a day.
     """
-    database = skindb.open(db)
+    database = skindb.open(db, create=False)
     if yes:
         garbage = workflow.clean(database, generations=generations)
     else:
@@ -290,7 +290,7 @@ def backup(db: str, destination: str, verify: bool) -> None:
     meanwhile. An interrupted backup is continued by the same command. Subjects who were
     withdrawn are removed from all earlier states.
     """
-    report = workflow.backup(skindb.open(db), destination, verify=verify)
+    report = workflow.backup(skindb.open(db, create=False), destination, verify=verify)
     lines = [
         f"state {report.number}: {report.versions} versions",
         f"files: {report.copied} copied ({report.bytes / 1e6:.1f} MB), {report.present} present, "

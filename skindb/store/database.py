@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -639,7 +640,7 @@ class Database:
 
 
 def open(  # noqa: A001  as in xarray and zarr
-    url: str | os.PathLike[str], *, create: bool = False
+    url: str | os.PathLike[str], *, create: bool | None = None
 ) -> Database:
     """Open a database.
 
@@ -648,7 +649,8 @@ def open(  # noqa: A001  as in xarray and zarr
     url
         See `Database`.
     create
-        Whether the database may be absent; its first commit then creates it.
+        Whether the database may be absent; its first commit then creates it. By default it
+        may, with a warning.
 
     Returns
     -------
@@ -658,19 +660,22 @@ def open(  # noqa: A001  as in xarray and zarr
     Raises
     ------
     InputError
-        If there is no database, unless `create` is set.
+        If there is no database, and `create` is False; if the folder is something else.
     """
     db = Database(url)
     if create:
         return db
     names = db.names()
+    if names is None and create is None:
+        text = f"{db.url}: there is no database; the first ingest will create it"
+        warnings.warn(text, stacklevel=2)
+        return db
     require(
         names is not None,
         db.url,
         "the database must exist",
         "nothing",
-        "correct the path, or create it: skindb ingest, or "
-        "skindb.open(..., create=True) in Python",
+        "correct the path, or ingest a capture into it first",
     )
     entries = set(names or ())
     # a bucket without records has no log
