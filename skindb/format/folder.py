@@ -296,7 +296,10 @@ class _Reader:
                     f"the name {short(name)}",
                     "rename it, for example skin_condition",
                 )
-            if isinstance(value, str):
+            if name == "age" and not is_number(value):
+                rule = "age must be a number of years"
+                traits.fault(name, rule, shown(value), "write, for example, 31")
+            elif isinstance(value, str):
                 traits.require_printable(name, value)
             elif not isinstance(value, bool) and not (
                 is_number(value) and abs(value) <= MAX_MAGNITUDE

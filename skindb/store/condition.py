@@ -49,7 +49,7 @@ def evaluate(text: str, columns: Mapping[str, Column]) -> tuple[Truth, list[str]
     text
         The condition, for example ``condition == 'lotion' and age > 40``.
     columns
-        Name -> values of all rows; at least one column.
+        Name -> values of all rows, with the column take.
 
     Returns
     -------
@@ -175,6 +175,9 @@ class _Evaluation:
         kinds = _kinds(left), _kinds(right)
         # a column of several kinds has no order
         has_no_order = op not in (ast.Eq, ast.NotEq) and len(set.union(*kinds)) > 1
+        if has_no_order:
+            self.require_one_kind(left, kinds[1])
+            self.require_one_kind(right, kinds[0])
         if has_no_order or (all(kinds) and not set.intersection(*kinds)):
             raise self.fault(
                 "must compare text with text and numbers with numbers",
@@ -182,6 +185,19 @@ class _Evaluation:
                 "put text in quotes, and write numbers without them",
             )
         return [_compared(op, *pair) for pair in zip(left, right, strict=True)]
+
+    def require_one_kind(self, values: Column, others: set[str]) -> None:
+        """Require one kind of values if one of them is the kind of the `others`."""
+        (expected,) = others if len(others) == 1 else {NUMBER}
+        if expected not in _kinds(values):
+            return
+        for row, value in enumerate(values):
+            if not is_missing(value) and _kind(value) != expected:
+                raise self.fault(
+                    f"must compare {expected} with {expected} in all takes",
+                    f"{value!r} of {self.columns['take'][row]}",
+                    "correct it in capture.json of this take, and ingest it again",
+                )
 
     def dates(self, values: Column) -> Column:
         """Values with dates in place of texts."""

@@ -180,6 +180,10 @@ FAULTS = {
         put(C, "consent", "reference", value="\x07"),
         r"\[reference\]: a text .* can be",
     ),
+    "age with its unit": (
+        put(C, "traits", "age", value="31 years"),
+        r"\[traits\]\[age\]: age must be a number of years; found the text .31 years",
+    ),
     "nested trait": (put(C, "traits", "age", value=[30]), r"\[traits\]\[age\]"),
     "missing frame": (
         lambda f: (f / FRAME).unlink(),

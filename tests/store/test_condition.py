@@ -188,7 +188,11 @@ def test_evaluate__hostile_expressions_are_refused_in_one_line_or_harmless(
         ),
         ("age in [20, 'x']", "text with text and numbers with numbers"),
         ("outdated == 1", "found true or false beside a number"),
-        ("mixed < 3", "text with text and numbers with numbers"),
+        (
+            "mixed < 3",
+            "a number with a number in all takes; found 'II' of T1 in 'mixed <",
+        ),
+        ("'I' < mixed", "text with text in all takes; found 1 of T0 in"),
         ("model_created > 'May'", "must compare a date with a date; found 'May'"),
         ("model_created > '0001-01-01T00:00+14:00'", "must compare a date with a date"),
         ("model_created > 3", "found a date beside a number"),
@@ -213,6 +217,7 @@ def test_evaluate__hostile_expressions_are_refused_in_one_line_or_harmless(
 )
 def test_evaluate__says_what_is_wrong(text, line):
     columns = table(random.Random(0), missing=True) | {"mixed": [1, "II"] * (ROWS // 2)}
+    columns["take"] = [f"T{row}" for row in range(ROWS)]
     with pytest.raises(InputError, match=f"^where: a condition .*{line}") as refused:
         evaluate(text, columns)
     assert len(refused.value.faults) == 1
