@@ -266,8 +266,9 @@ class IngestParameters(Limited):
     Parameters
     ----------
     spacing_mm
-        Distance of neighbouring surfels, in the mean over the surface; points of a scan
-        that are closer to each other stay.
+        Distance of neighbouring surfels: that of an even lattice of as many surfels on the
+        scan, or the width of the squares of a picture from which the surface is estimated.
+        Points of a scan that are closer to each other stay.
     photographs
         Number of merged photographs kept for comparisons.
     calibration
@@ -281,7 +282,8 @@ class IngestParameters(Limited):
 
     spacing_mm: float = option(
         1.5,
-        "Distance between neighbouring surfels in mm.",
+        "Distance between neighbouring surfels in mm: the mean over the scan, or "
+        "without a scan that in the picture.",
         name="spacing",
         minimum=0.05,
         maximum=MAX_SPACING_MM,

@@ -230,7 +230,9 @@ class _Run:
         spacing = self.surfels.spacing()
         notes = [*self.notes]
         wanted = self.parameters.spacing_mm
-        if self.relief is not None:
+        if self.relief is not None and self.capture.dome is not None:
+            (camera,) = self.capture.dome.cameras
+            spacing = self.relief.step * camera.pixel_width(np.zeros(3))
             notes += self.relief.notes
             if spacing > 1.5 * wanted:
                 notes.append(

@@ -403,6 +403,11 @@ class _Frames:
             dome["relative_exposure"] = exposure
         time = datetime.fromtimestamp(self.newest, UTC)
         record = _record(person, time) | {"dome": "dome/dome.json"}
+        if "session" not in person:
+            self.notes.append(
+                f"session {record['session']} is the time of the newest picture file; "
+                "correct it in capture.json if that is no photograph's"
+            )
         if scan is not None:
             record["mesh"] = f"scan{scan.suffix.lower()}"
             content = read_regular(scan, MAX_SCAN_BYTES)

@@ -35,6 +35,7 @@ PROCESS = "process.json"
 # sRGB of the brightest hundredth of the albedo, which is relative
 BRIGHT = 0.9
 PAGE = "page.html"
+NO_SESSION = "1970-01-01T00:00:00+00:00"  # nothing of it is stored
 MAPS = ("normals", "albedo", "gloss")
 
 
@@ -117,7 +118,7 @@ def quick(
         imported = import_images(
             source,
             capture,
-            {"subject": "pictures", "consent": consent},
+            {"subject": "pictures", "session": NO_SESSION, "consent": consent},
             progress=progress,
             **known,
         )

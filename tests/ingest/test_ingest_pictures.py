@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import unicodedata
 from collections.abc import Sequence
@@ -94,6 +95,8 @@ def test_a_surface_is_estimated_without_a_scan(pictures: Path, tmp_path: Path) -
     assert any(
         "limited to the pixels" in note for note in tree.attrs["summary"]["notes"]
     )
+    # a pixel, although the area of a surfel is larger on slopes
+    assert tree.attrs["summary"]["surfels"]["spacing_mm"] == pytest.approx(1.0)
     assert any("relative" in line for line in tree.attrs["skipped"])
 
 
@@ -737,6 +740,19 @@ def test_notes_name_what_is_odd(pictures: Path, tmp_path: Path) -> None:
     notes = import_images(pictures, tmp_path / "capture", PERSON).notes
     assert "pictures without a light are not used: picture 8.png" in notes
     assert "lights behind the subject, z not above 0: picture 7.png" in notes
+
+
+def test_a_session_from_the_times_of_files_is_noted(
+    pictures: Path, tmp_path: Path
+) -> None:
+    for k, file in enumerate(sorted(pictures.glob("*.png"))):
+        os.utime(file, (1e9 + k, 1e9 + k))
+    notes = import_images(pictures, tmp_path / "capture", PERSON).notes
+    start = "session 2001-09-09T01:46:48+00:00 is the time of the newest picture file"
+    assert any(note.startswith(start) for note in notes)
+    stated = PERSON | {"session": "2005-01-10T09:00:00+01:00"}
+    notes = import_images(pictures, tmp_path / "stated", stated).notes
+    assert not any(note.startswith("session") for note in notes)
 
 
 def test_the_first_picture_is_named_if_it_differs(
