@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields
+from numbers import Integral, Real
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, Self, Union, get_args, get_origin, get_type_hints
@@ -130,7 +131,10 @@ def broken_rule(limits: Option, hint: Any, value: Any) -> str:
         return f"must be one of {', '.join(words)}"
     if low is None or value is None:
         return ""
-    number = math.nan if words and isinstance(value, str) else value
+    is_number = isinstance(value, Integral if hint is int else Real)
+    if not words and (not is_number or isinstance(value, bool)):
+        return "must be a whole number" if hint is int else "must be a number"
+    number = value if is_number else math.nan
     inside = number > low if limits.above_minimum else number >= low
     if inside and (high is None or number <= high):
         return ""

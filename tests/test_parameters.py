@@ -57,6 +57,14 @@ def test_parameters__every_fault_is_reported_at_once():
     ]
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("k", "two"), ("k", 2.5), ("eta", "glass")]
+)
+def test_parameters__a_value_that_is_no_number(name, value):
+    with pytest.raises(InputError, match=rf"{name}: must be a (whole )?number; found "):
+        FitParameters(**{name: value})
+
+
 @pytest.mark.parametrize("name", RECORDS)
 def test_options_of__every_field_is_an_option_with_its_default(name):
     options = {option.name: option for option in cli.commands[name].params}

@@ -19,7 +19,16 @@ from skindb.geometry.mesh import vertex_normals
 from skindb.numerics.texture import quantile_levels, valid_quantiles
 from skindb.optics.diffusion import dipole_s
 from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, stored_brdf
-from skindb.schema import GROUPS, Use, check, dataset, label, names_of, variables
+from skindb.schema import (
+    GROUPS,
+    Use,
+    check,
+    dataset,
+    fitted_of,
+    label,
+    names_of,
+    variables,
+)
 from skindb.schema.consent import honour_consent
 from skindb.schema.label import FACE, take_attrs
 from skindb.types import Array, Mask, finite_rows, float64, unit
@@ -105,7 +114,7 @@ def apply_traits(
     needed = [v.name for v in GROUPS["traits"] if v.name != TEXTURE_SHIFT]
     check(traits, needed, where="traits (run skindb analyze DB traits again)")
     amount = _trait_amounts(amounts, traits)
-    fitted = model["fitted"].dataset.load()
+    fitted = fitted_of(model).load()
     tree = model.copy()
     reports = {}
     shift = amount @ traits[variables.TRAIT_BRDF_SHIFT].values
@@ -236,7 +245,7 @@ def move_along_modes(
     uv
         (surfel, 2) common (u, v) of the surfels, from `register`.
     """
-    fitted = model["fitted"].dataset.load()
+    fitted = fitted_of(model).load()
     steps = float64(scores)
     modes = np.tensordot(steps, faces[variables.FACE_MODE].values[: len(steps)], 1)
     maps = np.concatenate([faces[variables.FACE_MEAN].values, modes])
@@ -291,7 +300,7 @@ def with_basis(
     tables
         (nh, nd, np, m) tables of the dictionary the model was fitted with [sr^-1].
     """
-    fitted = model["fitted"].dataset.load()
+    fitted = fitted_of(model).load()
     tree = model.copy()
     weights = _projected(fitted, float64(mixture), brdf_metric(tables))
     tree["basis"] = DataTree(_common_basis(model, mixture, names, tables))

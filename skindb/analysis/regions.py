@@ -13,7 +13,7 @@ from skimage.measure import points_in_poly
 from xarray import Dataset, DataTree
 
 from skindb.files import package_json
-from skindb.schema import variables
+from skindb.schema import fitted_of, variables
 from skindb.schema.label import FACE
 from skindb.types import Array, Mask, float64
 
@@ -122,7 +122,7 @@ def take_masks(model: DataTree, registered: Dataset | None = None) -> dict[str, 
     """Masks (n,) of the regions of a take; those of its capture replace those defined
     by the landmarks.
     """
-    return landmark_masks(registered) | own_masks(model["fitted"].dataset)
+    return landmark_masks(registered) | own_masks(fitted_of(model))
 
 
 @cache

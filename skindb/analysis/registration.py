@@ -26,7 +26,7 @@ from skindb.geometry.warp import (
     fit_warp,
     left_out_error,
 )
-from skindb.schema import dataset, variables
+from skindb.schema import dataset, fitted_of, variables
 from skindb.schema.consent import honour_consent
 from skindb.schema.notes import Note, note
 from skindb.types import Array, Float64, Index, finite_rows, float64, lengths
@@ -413,7 +413,7 @@ def surface_of(
     model: DataTree,
 ) -> tuple[Float64, Float64, Index]:
     """Positions (n, 3) in mm, texture coordinates (n, 2) and triangles (f, 3) of a take."""
-    fitted = model["fitted"].dataset
+    fitted = fitted_of(model)
     faces = model["mesh"].dataset[variables.TRIANGLE].values
     position, uv = (
         fitted[name].values.astype(float)

@@ -14,7 +14,15 @@ from skindb.analysis.roughness import MIN_AREA, Deviations, band_deviations
 from skindb.errors import InputError, input_error, require
 from skindb.geometry.atlas import atlas_values, push_pull, rasterise_atlas
 from skindb.render.surfels import surfel_texels, texel_codes
-from skindb.schema import FitStatus, TexelStatus, Use, dataset, names_of, variables
+from skindb.schema import (
+    FitStatus,
+    TexelStatus,
+    Use,
+    dataset,
+    fitted_of,
+    names_of,
+    variables,
+)
 from skindb.schema.cohort import Held, combine, take_coords
 from skindb.schema.consent import consent_scope
 from skindb.schema.declaration import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
@@ -71,7 +79,7 @@ def sample_surfels(
     InputError
         If no surfel was fitted.
     """
-    fitted = model["fitted"].dataset
+    fitted = fitted_of(model)
     good = np.flatnonzero(fitted[variables.FIT_STATUS].values == FitStatus.FITTED)
     if not good.size:
         raise no_surfels_error(model)
@@ -103,7 +111,7 @@ def summary_tables(model: DataTree) -> Dataset:
         reflectance with their errors. For every site: sigma_tr with its errors and
         status. Mean weights of the dictionary, and the radius of the lights' discs.
     """
-    fitted = model["fitted"].dataset.load()
+    fitted = fitted_of(model).load()
     basis = model["basis"].dataset
     masks = {FACE: np.ones(fitted.sizes["surfel"], bool)} | own_masks(fitted)
     parts = [
@@ -435,7 +443,7 @@ def common_maps(
         is trusted, and why not) and `texel_coverage`. Inside the face, values that were
         not measured are interpolated from the surrounding texels; outside they are NaN.
     """
-    fitted = model["fitted"].dataset
+    fitted = fitted_of(model)
     triangles = model["mesh"].dataset[variables.TRIANGLE].values
     uv = registered[variables.COMMON_UV].values
     codes = surfel_texels(fitted)

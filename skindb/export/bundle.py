@@ -32,7 +32,15 @@ from skindb.reflectance.dictionary import Dictionary
 from skindb.reflectance.kinds import as_mixture
 from skindb.reflectance.tables import TableGrid, kernel_tables, lookup
 from skindb.render.image import write_exr
-from skindb.schema import VARIABLES, FitStatus, ProbeStatus, Use, names_of, variables
+from skindb.schema import (
+    VARIABLES,
+    FitStatus,
+    ProbeStatus,
+    Use,
+    fitted_of,
+    names_of,
+    variables,
+)
 from skindb.schema.consent import require_consent
 from skindb.types import Float32, Float64, Progress, float64, silent
 
@@ -292,7 +300,7 @@ def _write_bases(basis: xr.Dataset, folder: Path, merl: bool) -> Files:
 
 def _manifest(model: xr.DataTree, folder: Path, files: Files) -> Json:
     attrs = model.attrs
-    fitted = model["fitted"].to_dataset()
+    fitted = fitted_of(model)
     return {
         "format": "skindb-bundle",
         "version": 1,

@@ -13,7 +13,7 @@ from skindb.errors import require
 from skindb.files import Json, plain
 from skindb.optics.diffusion import dipole_s
 from skindb.render.surfels import with_matt_surfels
-from skindb.schema import check, variables
+from skindb.schema import check, fitted_of, variables
 from skindb.types import Array, float64, lengths
 
 REQUIRED = (
@@ -45,7 +45,7 @@ def texture_size(model: xr.DataTree) -> int:
     """Texels along each side of maps without loss: 1.5 per spacing of the surfels,
     rounded up to a power of two, and at least those of the detail.
     """
-    uv = model["fitted"].dataset[variables.SURFEL_UV].values
+    uv = fitted_of(model)[variables.SURFEL_UV].values
     triangles = model["mesh"].dataset[variables.TRIANGLE].values
     corners = uv.astype(float)[triangles]
     edge = np.median(lengths(corners - np.roll(corners, 1, axis=1)))
@@ -99,7 +99,7 @@ def required(model: xr.DataTree) -> xr.Dataset:
     InputError
         If variables are missing, or the texture coordinates are not finite or cover no area.
     """
-    fitted = model["fitted"].to_dataset()
+    fitted = fitted_of(model)
     check(fitted, REQUIRED, where="fitted")
     triangles = model["mesh"].dataset[variables.TRIANGLE].values
     corner = fitted[variables.SURFEL_UV].values[triangles].astype(float)

@@ -16,7 +16,7 @@ from skindb.geometry.atlas import atlas_values, push_pull, rasterise_atlas
 from skindb.geometry.interreflection import tangent_frames as perpendicular_frames
 from skindb.reflectance.kinds import as_mixture, even_diffuse
 from skindb.render.surfels import surfel_confidence, surfel_texels, texel_codes
-from skindb.schema import VARIABLES, TexelStatus, variables
+from skindb.schema import VARIABLES, TexelStatus, fitted_of, variables
 from skindb.types import (
     AnyArray,
     Array,
@@ -67,7 +67,7 @@ class Atlas:
     @classmethod
     def of(cls, model: xr.DataTree, size: int) -> Atlas:
         """The atlas of a model with `size` texels along each side."""
-        uv = model["fitted"].dataset[variables.SURFEL_UV].values
+        uv = fitted_of(model)[variables.SURFEL_UV].values
         triangles = model["mesh"].dataset[variables.TRIANGLE].values
         return cls(triangles, rasterise_atlas(uv, triangles, size))
 

@@ -12,7 +12,7 @@ from skindb import __version__
 from skindb.export.textures import Skin, index_of, unit_normals
 from skindb.files import filled_template, make_private, private_file
 from skindb.render.image import write_png
-from skindb.schema import variables
+from skindb.schema import fitted_of, variables
 from skindb.types import Array
 
 STAGE = "face.usda"
@@ -71,7 +71,7 @@ def export_usd(
 
 def _mesh(model: xr.DataTree) -> dict[str, str]:
     """The mesh as texts of a USD stage."""
-    fitted = model["fitted"].to_dataset()
+    fitted = fitted_of(model)
     place = fitted[variables.SURFEL_POSITION].values.astype(np.float32)
     triangles = model["mesh"].dataset[variables.TRIANGLE].values
     # v increases upwards in USD
@@ -104,7 +104,7 @@ def export_mitsuba(model: xr.DataTree, folder: Path) -> None:
     make_private(folder)
     program = filled_template("skindb.export", f"mitsuba/{PROGRAM}.txt")
     private_file(folder / PROGRAM).write_text(program, encoding="utf-8")
-    fitted = model["fitted"].to_dataset()
+    fitted = fitted_of(model)
     u, v = fitted[variables.SURFEL_UV].values.astype(np.float32).T
     mesh = trimesh.Trimesh(
         fitted[variables.SURFEL_POSITION].values,

@@ -12,7 +12,7 @@ from skindb.reflectance.ggx import GGX
 from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.model import ReflectanceModel, SurfaceKind
 from skindb.reflectance.tables import DEFAULT_GRID, brdf_coords, stored_brdf
-from skindb.schema import check, dataset, variables
+from skindb.schema import check, dataset, fitted_of, variables
 from skindb.types import Array
 
 # by the option `surface` of a fit
@@ -45,11 +45,11 @@ def as_mixture(model: xr.DataTree) -> xr.DataTree:
     """The model with its surface as a mixture of tables, for programs that read tables; a
     mixture is returned as it is.
     """
+    fitted = fitted_of(model)
     basis = model["basis"].to_dataset()
     surface = surface_model(basis)
     if isinstance(surface, Mixture):
         return model
-    fitted = model["fitted"].to_dataset()
     check(fitted, surface.parameter_variables, where="fitted")
     tables, weights = surface.resample(surface.parameters_of(fitted))
     names = [f"component{k}" for k in range(weights.shape[1])]

@@ -34,7 +34,7 @@ from skindb.render.shading import (
     trace_view,
 )
 from skindb.render.surfels import surfel_confidence
-from skindb.schema import check, variables
+from skindb.schema import check, fitted_of, variables
 from skindb.schema.consent import honour_consent
 from skindb.types import Array, Bytes, Float32, Float64, Mask, finite_rows, float64
 
@@ -273,7 +273,7 @@ def _compared(
     unseen_lights, unseen_cameras = (
         held_out_names(model, d) for d in ("light", "camera")
     )
-    is_filled = surfel_confidence(model["fitted"].to_dataset()) == 0
+    is_filled = surfel_confidence(fitted_of(model)) == 0
     for photograph in photographs:
         at_light = int(photograph[variables.PHOTOGRAPH_LIGHT])
         at_camera = int(photograph[variables.PHOTOGRAPH_CAMERA])

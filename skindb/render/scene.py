@@ -26,7 +26,7 @@ from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.kinds import even_diffuse, surface_model
 from skindb.reflectance.model import ReflectanceModel
 from skindb.render.image import read_exr
-from skindb.schema import FitStatus, check, variables
+from skindb.schema import FitStatus, check, fitted_of, variables
 from skindb.types import (
     AnyArray,
     Array,
@@ -207,7 +207,7 @@ def from_model(model: xr.DataTree) -> Surface:
     Surface
         The surface; it has `sigma_tr` only if the model has translucency.
     """
-    fitted = model["fitted"].to_dataset()
+    fitted = fitted_of(model)
     basis = model["basis"].to_dataset()
     reflectance = surface_model(basis)
     names = (*NEEDED, *reflectance.parameter_variables, variables.REFRACTIVE_INDEX)

@@ -13,7 +13,15 @@ from skindb.geometry.interreflection import tangent_frames
 from skindb.reflectance.kinds import even_diffuse, surface_model
 from skindb.reflectance.model import Lamp, Points, ReflectanceModel
 from skindb.render.scene import usable_surfels
-from skindb.schema import FitStatus, TexelStatus, Use, check, names_of, variables
+from skindb.schema import (
+    FitStatus,
+    TexelStatus,
+    Use,
+    check,
+    fitted_of,
+    names_of,
+    variables,
+)
 from skindb.schema.declaration import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
 from skindb.types import (
     Array,
@@ -204,7 +212,7 @@ def evaluate_error(
     InputError
         As `evaluate`.
     """
-    check(model["fitted"].to_dataset(), ERROR_INPUTS, where="fitted")
+    check(fitted_of(model), ERROR_INPUTS, where="fitted")
     rows, surface, to_light, to_camera, shape = _rows_of(model, surfel, wi, wo)
     errors = reflectance_errors(rows, surface, to_light, to_camera)
     return np.asarray(errors.reshape(shape), np.float32)
@@ -293,7 +301,7 @@ def _rows_of(
     """One surfel, checked and repeated for every pair of directions, its surface model, the
     directions (n, 3), and their shape.
     """
-    fitted = model["fitted"].to_dataset()
+    fitted = fitted_of(model)
     surface = surface_model(model["basis"].to_dataset())
     names = (*NEEDED, *surface.parameter_variables, variables.REFRACTIVE_INDEX)
     check(fitted, names, where="fitted")

@@ -11,7 +11,7 @@ from skindb.schema.declaration import (
     flag_attrs,
     names_of,
 )
-from skindb.schema.label import check, dataset, label, text_labels
+from skindb.schema.label import check, dataset, fitted_of, label, text_labels
 from skindb.schema.notes import note_lines
 from skindb.schema.variables import GROUPS, SCHEMA_VERSION, VARIABLES
 
@@ -28,6 +28,7 @@ __all__ = [
     "Variable",
     "check",
     "dataset",
+    "fitted_of",
     "flag_attrs",
     "label",
     "names_of",

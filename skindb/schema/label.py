@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
-from xarray import Dataset, Variable
+from xarray import Dataset, DataTree, Variable
 
-from skindb.errors import Fault, require_none
+from skindb.errors import Fault, require, require_none
 from skindb.schema.declaration import flag_attrs
 from skindb.schema.variables import VARIABLES
 
@@ -68,6 +68,18 @@ def text_labels(values: Any) -> np.ndarray[Any, Any]:
     """Labels as an array; strings as variable-length text, which zarr v3 can store."""
     array = np.asarray(values)
     return array.astype(np.dtypes.StringDType()) if array.dtype.kind in "UO" else array
+
+
+def fitted_of(model: DataTree) -> Dataset:
+    """The group "fitted" of a model; `InputError` if it is another version, such as a capture."""
+    require(
+        "fitted" in model.children,
+        str(model.attrs.get("take", "version")),
+        "must be a model, which has the group fitted",
+        f"the groups {', '.join(model.children) or 'none'}",
+        "fit the capture first, and read the model: db.read('model', take)",
+    )
+    return model["fitted"].to_dataset()
 
 
 def check(ds: Dataset, names: Iterable[str], *, where: str = "dataset") -> None:

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import pickle
 import re
+from functools import partial
 
 import numpy as np
 import pytest
+from planted_cohort import EVERYTHING, PEOPLE, capture
 
+import skindb
 from skindb.errors import InputError
+from skindb.render.scene import from_model
 from skindb.schema import (
     GROUPS,
     VARIABLES,
@@ -129,3 +133,17 @@ def test_take_name__drops_what_is_first_or_normal(parts, name):
 def test_take__other_names_are_refused():
     for name in ("3.lotion.0", "3.lotion.02", "3.lotion.2.2.2", "3.lotion.b", "3..2"):
         assert not re.fullmatch(TAKE, name)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        from_model,
+        skindb.export.texture_maps,
+        skindb.analysis.summary_tables,
+        partial(skindb.render.evaluate, surfel=0, wi=(0, 0, 1), wo=(0, 0, 1)),
+    ],
+)
+def test_fitted_of__a_capture_is_no_model(call):
+    with pytest.raises(InputError, match="S01: must be a model, which has the group"):
+        call(capture("S01", PEOPLE["S01"] | {"scope": [*EVERYTHING]}, 0))
