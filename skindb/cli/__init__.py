@@ -199,7 +199,10 @@ def main() -> None:
             ],
         )
     except (click.Abort, KeyboardInterrupt):
-        message = "interrupted; no incomplete version was committed"
+        message = "interrupted"
+        command = cli.commands.get("".join(sys.argv[1:2]))
+        if command and any(param.name == "db" for param in command.params):
+            message += "; no incomplete version was committed"
         echo(f"skindb: {message}", err=True)
         _give_up(
             INTERRUPTED, [Fault("skindb", "must run until it is finished", message)]

@@ -3,6 +3,7 @@
 import signal
 import sys
 from dataclasses import asdict
+from functools import cache
 from pathlib import Path
 
 import click
@@ -15,6 +16,7 @@ from skindb.cli.terminal import bar, echo
 from skindb.limits import MAX_VISIT
 from skindb.parameters import ImportParameters, QuickParameters
 
+COMPILING = "note: kernels are compiled, which takes minutes after an installation"
 SOURCE = click.argument("source", type=PATH)
 OUT = click.argument("out", type=PATH)
 
@@ -95,7 +97,15 @@ def quick(source: Path, out: Path, parameters: QuickParameters) -> None:
     """
     # the folder with copies of the pictures is removed at the end
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    result = workflow.quick(source, out, progress=bar(), **asdict(parameters))
+    progress = bar()
+    is_shown = progress.bars or progress.style == "json"
+    result = workflow.quick(
+        source,
+        out,
+        progress=progress,
+        compiling=None if is_shown else cache(lambda: echo(COMPILING, err=True)),
+        **asdict(parameters),
+    )
     for note in result["notes"]:
         echo(f"note: {note}", err=True)
     total = sum(result["points"].values())

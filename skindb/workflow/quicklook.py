@@ -4,8 +4,8 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from skindb.fit.plan import RELATIVE
 from skindb.format.fields import read_json
 from skindb.geometry.camera import project
 from skindb.ingest.pictures import import_images
+from skindb.jit import reported_compilation
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.parameters import FitParameters, QuickParameters
 from skindb.render.image import write_exr, write_png
@@ -44,6 +45,7 @@ def quick(
     out: str | Path,
     *,
     progress: Progress = silent,
+    compiling: Callable[[], None] | None = None,
     **parameters: Any,
 ) -> Json:
     """Maps of normals, albedo and gloss, and a page to turn and light them, from pictures
@@ -59,6 +61,8 @@ def quick(
         Albedo is the fraction of light along the normal that is reflected in total,
         gloss the part of the surface; both are relative.
         It must not hold these files.
+    compiling
+        Called before each kernel that is compiled, which takes minutes in the first call.
     **parameters
         Of `skindb.parameters.QuickParameters`: eta, points, and those of `import_images`.
 
@@ -111,6 +115,7 @@ def quick(
         private_umask(),
         tempfile.TemporaryDirectory(prefix=PREFIX) as folder,
         _naming(source, folder),
+        reported_compilation(compiling) if compiling else nullcontext(),
     ):
         # which a killed run leaves
         private_file(Path(folder) / PROCESS).write_text(json.dumps(this_process()))

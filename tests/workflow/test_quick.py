@@ -13,6 +13,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
+from numba.core import event
 from planted_pictures import directions, sphere_normals, write_pictures, write_table
 
 import skindb
@@ -266,3 +267,19 @@ def test_quick_removes_what_a_killed_run_left(
     assert result.returncode == 0, result.stderr
     left = sorted(path.name for path in tmp_path.glob("skindb-*"))
     assert left == ["skindb-quick-running", "skindb-quick-unknown"]
+
+
+def test_quick_prints_once_that_it_compiles(
+    pictures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def compile_two(*_: object, **__: object) -> None:
+        for _ in range(2):
+            with event.trigger_event("numba:compile"):
+                pass
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("skindb.workflow.quicklook.ingest_take", compile_two)
+    result = run("quick", pictures, tmp_path / "out", "--no-progress")
+    note = "note: kernels are compiled, which takes minutes after an installation"
+    assert [*filter(None, result.stderr.split("\n"))] == [note, "skindb: interrupted"]
+    assert result.returncode == 130
