@@ -62,6 +62,11 @@ def few_names(names: Sequence[str], count: int = 3, separator: str = ", ") -> st
     return separator.join(names[:count]) + (f" and {rest} more" if rest > 0 else "")
 
 
+def counted(count: int, noun: str) -> str:
+    """A number of things, such as "1 take" or "2 takes"."""
+    return f"{count:,} {noun}" + ("" if count == 1 else "s")
+
+
 def choices(name: str, known: Iterable[str], verb: str = "choose") -> str:
     """The cure for an unknown name: the known names, behind the most similar one."""
     near = get_close_matches(name.lower(), known := sorted(known), n=1)

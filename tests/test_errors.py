@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from skindb.errors import Fault, grouped
+from skindb.errors import Fault, counted, grouped
 
 
 def test_grouped__many_faults_of_one_place_and_rule_are_one_line():
@@ -11,3 +11,8 @@ def test_grouped__many_faults_of_one_place_and_rule_are_one_line():
         *other,
     ]
     assert grouped([]) == []
+
+
+def test_counted__one_and_many():
+    texts = [counted(count, "take") for count in (0, 1, 2, 1_000)]
+    assert texts == ["0 takes", "1 take", "2 takes", "1,000 takes"]

@@ -24,7 +24,7 @@ from skindb.analysis.study import (
 )
 from skindb.analysis.subjects import grouped, level_error
 from skindb.analysis.summary import SAMPLED
-from skindb.errors import require
+from skindb.errors import counted, require
 from skindb.numerics.statistics import SUMMARY, known_mean
 from skindb.numerics.texture import QUANTILES, quantile_levels
 from skindb.schema import dataset, variables
@@ -310,7 +310,7 @@ def plot_albedo(
     if has_legend:
         plots.legend_beside(ax)
     else:
-        ax.set_title(f"{len(names)} takes", fontsize=8)
+        ax.set_title(counted(len(names), "take"), fontsize=8)
     ax.set_xlabel("decorrelated colour, axis 0 [standard deviations]")
     ax.set_ylabel("fraction of the area")
     ax.set_ylim(bottom=0)

@@ -20,7 +20,7 @@ from skindb.analysis.subjects import (
     Subjects,
     subjects_of,
 )
-from skindb.errors import few_names, require
+from skindb.errors import counted, few_names, require
 from skindb.schema import IDENTIFIED, dataset, variables
 from skindb.schema.cohort import require_takes
 from skindb.study_parameters import DECLARED
@@ -235,7 +235,8 @@ def _unknown(
 def describe_coverage(report: Dataset) -> list[str]:
     """Numbers of subjects and takes, and the flags of a coverage report, one line each."""
     return [
-        f"{report.attrs['subjects']} subjects, {len(report.attrs['takes'])} takes",
+        f"{counted(report.attrs['subjects'], 'subject')}, "
+        f"{counted(len(report.attrs['takes']), 'take')}",
         *report.attrs["flags"],
     ]
 

@@ -13,7 +13,7 @@ from skindb.analysis.brdf import project
 from skindb.analysis.face_models import BLOCKS, block_rows
 from skindb.analysis.subjects import trait_name
 from skindb.analysis.texture import at_surfels, edit_texture
-from skindb.errors import Fault, InputError, require
+from skindb.errors import Fault, InputError, counted, require
 from skindb.geometry.atlas import push_pull
 from skindb.geometry.mesh import vertex_normals
 from skindb.numerics.texture import quantile_levels, valid_quantiles
@@ -155,7 +155,7 @@ def _notes(traits: Dataset, amount: Array) -> list[str]:
         count, without = traits[variables.TRAIT_COUNT].values[i].tolist()
         # for a numeric attribute, all takes are counted on one side
         sides = f" with, {without} without" if without else ""
-        notes.append(flagged.get(name, f"{name}: {count} takes{sides}"))
+        notes.append(flagged.get(name, f"{name}: {counted(count, 'take')}{sides}"))
     return notes
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from xarray import Dataset, DataTree
 
-from skindb.errors import require
+from skindb.errors import counted, require
 from skindb.geometry.atlas import signed_areas
 from skindb.geometry.landmarks import mean_shape
 from skindb.geometry.mesh import closest_on_mesh
@@ -394,7 +394,8 @@ def describe_registration(registered: Registered, takes: Iterable[str]) -> list[
         return [note("", reason)]
     _, rows = tabulate_registration(registered)
     kinds = ", ".join(sorted({str(row[1]) for row in rows}))
-    line = f"{len(rows)} takes with up to {max(row[2] for row in rows)} landmarks ({kinds})"
+    most = max(row[2] for row in rows)
+    line = f"{counted(len(rows), 'take')} with up to {most} landmarks ({kinds})"
     notes = doubtful_landmarks(registered)
     measured = [row for row in rows if np.isfinite(row[6])]
     if measured:

@@ -33,7 +33,7 @@ from skindb.cli.shared import (
     summary_of,
 )
 from skindb.cli.terminal import bar, echo
-from skindb.errors import require
+from skindb.errors import counted, require
 from skindb.limits import MAX_COHORT, MAX_DEMO_TAKES, MAX_VIRTUAL_VISITS, MAX_VISIT
 from skindb.parameters import (
     CONDITIONS,
@@ -241,7 +241,7 @@ def _ingested(
     lines = []
     if surfels := figures.get("surfels"):
         spacing = f"{surfels['spacing_mm']:.2g} mm apart"
-        lines.append(f"{surfels['count']:,} surfels, {spacing}")
+        lines.append(f"{counted(surfels['count'], 'surfel')}, {spacing}")
     lines += calibrated_by_lines(record.provenance)
     if "samples" in figures:
         lines += skindb.ingest.sample_lines(figures["samples"])

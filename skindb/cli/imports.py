@@ -13,6 +13,7 @@ from skindb import workflow
 from skindb.cli.options import PATH, command, options_of
 from skindb.cli.shared import emit
 from skindb.cli.terminal import bar, echo
+from skindb.errors import counted
 from skindb.limits import MAX_VISIT
 from skindb.parameters import ImportParameters, QuickParameters
 
@@ -78,7 +79,7 @@ def import_command(
     result = call(source, out, person, progress=bar(), **asdict(parameters))
     for note in result.notes:
         echo(f"note: {note}", err=True)
-    count = f"{result.lights} lights, {result.cameras} cameras"
+    count = f"{counted(result.lights, 'light')}, {counted(result.cameras, 'camera')}"
     emit(
         {"capture": str(result.folder), "notes": list(result.notes)},
         [f"{result.folder}: {count}"],

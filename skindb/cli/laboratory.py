@@ -9,6 +9,7 @@ from skindb import workflow
 from skindb.cli.options import DB, PATH, PORT, command, options_of
 from skindb.cli.shared import aligned, emit, indented, serve, writable
 from skindb.cli.terminal import bar, wait_for_enter
+from skindb.errors import counted
 from skindb.files import Json
 from skindb.parameters import CalibrationParameters, SessionParameters
 
@@ -66,7 +67,8 @@ def capture(
     emit(
         report,
         [
-            f"{out}: {report['frames']} frames{before} in {report['seconds']:.1f} s, {rate}",
+            f"{out}: {counted(report['frames'], 'frame')}{before} in "
+            f"{report['seconds']:.1f} s, {rate}",
             *report["notes"],
         ],
     )
@@ -76,7 +78,9 @@ def _recording_lines(report: Json) -> list[str]:
     """What a recording of a calibration target has, one line each."""
     places = report["places"]
     at = f" at {places} places" if places > 1 else ""
-    lines = [f"{report['path']}: {report['frames']} frames of {report['kind']}{at}"]
+    lines = [
+        f"{report['path']}: {counted(report['frames'], 'frame')} of {report['kind']}{at}"
+    ]
     if rms := report.get("rms_px"):
         worst = max(rms, key=rms.get)
         lines.append(
@@ -170,9 +174,10 @@ def calibrate(
         "generation": record.generation,
         "path": record.path,
     }
-    source = f" from {len(report['takes'])} takes" if from_takes else ""
+    source = f" from {counted(len(report['takes']), 'take')}" if from_takes else ""
     title = (
-        f"{record.take}: calibration {record.generation} of {report['lights']} lights"
+        f"{record.take}: calibration {record.generation} of "
+        f"{counted(report['lights'], 'light')}"
         f"{source}, {record.path}"
     )
     emit(summary | report, [title, *indented(lines)])
@@ -249,7 +254,7 @@ def _camera_lines(calibrated: Json) -> list[str]:
         "known points": "rms distance from their projections at most {reprojection_rms:.2f} px",
     }
     return [
-        f"{name} of {figures['cameras']} cameras: {words[name].format(**figures)}"
+        f"{name} of {counted(figures['cameras'], 'camera')}: {words[name].format(**figures)}"
         for name, figures in calibrated.items()
     ]
 

@@ -29,7 +29,7 @@ from skindb.cli.shared import (
     writable,
 )
 from skindb.cli.terminal import bar
-from skindb.errors import few_names
+from skindb.errors import counted, few_names
 from skindb.parameters import DICTIONARY_HELP, EditParameters
 
 if TYPE_CHECKING:
@@ -164,7 +164,9 @@ def _report_edit(record: Record, tree: DataTree) -> None:
     """Print the report of an edit that was stored."""
     takes = tree.attrs["study_takes"]
     title = f"{record.take}: edit {record.generation}; {_distance(tree)}"
-    source = f"traits from the study of {len(takes)} takes: {few_names(takes)}"
+    source = (
+        f"traits from the study of {counted(len(takes), 'take')}: {few_names(takes)}"
+    )
     summary = {
         "generation": record.generation,
         "path": record.path,

@@ -24,7 +24,7 @@ from skindb.cli.options import (
 )
 from skindb.cli.shared import aligned, cluster, emit, shared_path, writable
 from skindb.cli.terminal import HelpContext, bar
-from skindb.errors import input_error
+from skindb.errors import counted, input_error
 from skindb.files import Json, csv_text, private_file
 from skindb.study_parameters import DECLARED, Declaration
 
@@ -275,4 +275,4 @@ def tidy(db: str, takes: tuple[str, ...], release: str | None, out: Path) -> Non
         private_file(out).write_bytes(data)
     notes = {"skipped": skipped, "spacing": spacing}
     report = {"path": str(out), "rows": len(table)} | notes
-    emit(report, [f"{out}: {len(table)} rows", *_note_lines(notes)])
+    emit(report, [f"{out}: {counted(len(table), 'row')}", *_note_lines(notes)])

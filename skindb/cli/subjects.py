@@ -24,7 +24,7 @@ from skindb.cli.options import (
 )
 from skindb.cli.shared import cluster, emit, require_folder, shared_path
 from skindb.cli.terminal import bar, confirm, echo
-from skindb.errors import few_names, input_error, require
+from skindb.errors import counted, few_names, input_error, require
 from skindb.files import Json
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def release(
         for listed_name in ([name] if name else database.takes("release"))
     }
     lines = [
-        f"{listed_name}  {report['created']}  {len(report['takes'])} takes"
+        f"{listed_name}  {report['created']}  {counted(len(report['takes']), 'take')}"
         for listed_name, report in listed.items()
     ]
     emit(listed, lines or ["no releases"])
@@ -259,7 +259,7 @@ def withdraw(
     )
     lines.append(f"removed versions: {counts or 'none'}")
     lines += [
-        f"removed from {url}: {count} files"
+        f"removed from {url}: {counted(count, 'file')}"
         for url, count in zip(backups, withdrawal.backups, strict=True)
     ]
     if report is not None:

@@ -22,7 +22,7 @@ from skindb.cli.shared import (
     emit,
     indented,
 )
-from skindb.errors import InputError, input_error
+from skindb.errors import InputError, counted, input_error
 from skindb.files import Attributes, Json
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def _info_lines(database: Database, result: Json, *, details: bool) -> list[str]
         for versions in takes.values()
         for line in calibrated_by_lines(versions.get("capture", {}))
     )
-    lines += [f"{line}: {count} takes" for line, count in used.items()]
+    lines += [f"{line}: {counted(count, 'take')}" for line, count in used.items()]
     return lines + [version["fault"] for version in of_takes if "fault" in version]
 
 
@@ -292,7 +292,7 @@ def backup(db: str, destination: str, verify: bool) -> None:
     """
     report = workflow.backup(skindb.open(db, create=False), destination, verify=verify)
     lines = [
-        f"state {report.number}: {report.versions} versions",
+        f"state {report.number}: {counted(report.versions, 'version')}",
         f"files: {report.copied} copied ({report.bytes / 1e6:.1f} MB), {report.present} present, "
         f"{report.removed} removed",
     ]
@@ -349,7 +349,7 @@ def restore(
             for state in workflow.backup_states(source)
         ]
         rows = [
-            [f"state {n}", when, f"{count} versions"]
+            [f"state {n}", when, f"{counted(count, 'version')}"]
             for n, when, count in map(dict.values, listed)
         ]
         emit(listed, aligned(rows) if rows else ["no states"])
@@ -368,7 +368,8 @@ def restore(
 
 def _restored_lines(restored: Restored, without_markers: bool) -> list[str]:
     lines = {
-        f"state {restored.number} of {restored.created}: {restored.versions} versions, "
+        f"state {restored.number} of {restored.created}: "
+        f"{counted(restored.versions, 'version')}, "
         f"{restored.bytes / 1e6:.1f} MB": True,
         "subjects who were withdrawn after this state are in the database again: "
         "withdraw them again": without_markers,

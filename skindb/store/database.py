@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 from xarray import Dataset, DataTree
 
-from skindb.errors import Fault, InputError, input_error, require
+from skindb.errors import Fault, InputError, counted, input_error, require
 from skindb.files import Attributes, Json, make_private
 from skindb.schema.consent import CONSENT, require_consent
 from skindb.store.archive import Archive
@@ -80,7 +80,7 @@ class Database:
         self.place = place_at(text)
 
     def __repr__(self) -> str:
-        return f"<skindb.Database {self.url!r}: {len(self.takes())} takes>"
+        return f"<skindb.Database {self.url!r}: {counted(len(self.takes()), 'take')}>"
 
     def __eq__(self, other: object) -> bool:
         return (

@@ -15,7 +15,7 @@ from skindb import plots
 from skindb.analysis.brdf import describe_basis_size, plot_basis_size
 from skindb.analysis.brdf_plots import plot_group_spheres
 from skindb.analysis.studies import write_plot
-from skindb.errors import InputError, require
+from skindb.errors import InputError, counted, require
 from skindb.files import make_private, private_file
 from skindb.render.figures import write_grid
 from skindb.render.photographs import Comparison, compare_photographs
@@ -147,8 +147,8 @@ def reproduce(
     reasons = {}
     page = [
         "# Tables and figures of Weyrich et al. 2005",
-        f"{len(table)} takes of {table['subject'].nunique()} subjects; figures of one face "
-        f"are of {source.take}.",
+        f"{counted(len(table), 'take')} of {counted(table['subject'].nunique(), 'subject')}; "
+        f"figures of one face are of {source.take}.",
     ]
     with logged_action(db, "reproduce", models):
         for number, item in enumerate(ITEMS):

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from skindb.clock import SYSTEM_CLOCK, SimulatedClock, utc_time
-from skindb.errors import Fault, input_error, require_none
+from skindb.errors import Fault, counted, input_error, require_none
 from skindb.files import Json, make_private, private_umask
 from skindb.format.fields import IDENTIFIER, read_json
 from skindb.format.folder import read_capture, record_faults
@@ -64,15 +64,17 @@ def plan_session(
     schedule = with_markers(planned_schedule(setup, plan), marker_light(setup.dome))
     assessment = assess(schedule)
     lines = [
-        f"{len(setup.dome.lights)} lights, {len(setup.dome.exposures)} exposures, "
-        f"{len(setup.dome.cameras)} cameras: {assessment}"
+        f"{counted(len(setup.dome.lights), 'light')}, "
+        f"{counted(len(setup.dome.exposures), 'exposure')}, "
+        f"{counted(len(setup.dome.cameras), 'camera')}: {assessment}"
     ]
     if brackets := setup.brackets:
         sites = "each site that --sites names"
         if plan.sites:
             sites = f"each of {len(plan.sites)} sites"
         lines.append(
-            f"probe: {len(brackets)} exposures of together {sum(brackets.values()):.0f} s, "
+            f"probe: {counted(len(brackets), 'exposure')} of "
+            f"together {sum(brackets.values()):.0f} s, "
             f"placements: {plan.placements} at {sites}"
         )
     if not assessment.safe:

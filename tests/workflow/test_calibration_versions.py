@@ -182,7 +182,7 @@ def test_ingest__takes_the_positions_of_the_named_calibration(setup, capture, tm
     assert result.exit_code == 0, result.output
     assert "positions of the lights: standard error at most" in result.output
     assert (
-        "known points of 1 cameras: rms distance from their projections at most 1.50 px"
+        "known points of 1 camera: rms distance from their projections at most 1.50 px"
         in result.output
     )
     found = db.read("calibration", "dome-a")["position_calibration"].to_dataset().load()
