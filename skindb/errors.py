@@ -69,8 +69,10 @@ def counted(count: int, noun: str) -> str:
 
 def choices(name: str, known: Iterable[str], verb: str = "choose") -> str:
     """The cure for an unknown name: the known names, behind the most similar one."""
-    near = get_close_matches(name.lower(), known := sorted(known), n=1)
-    hint = f"did you mean {near[0]}? " if near else ""
+    known = sorted(known)
+    lowered = {one.lower(): one for one in known}
+    near = get_close_matches(name.lower(), lowered, n=1)
+    hint = f"did you mean {lowered[near[0]]}? " if near else ""
     return f"{hint}{verb} {', '.join(known) or 'none'}"
 
 

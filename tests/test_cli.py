@@ -698,12 +698,20 @@ def test_fit__faults_say_which_take_they_are_of(small_database):
     _, db = small_database
     done = _run("fit", db, "V001", "--rank", "0")
     assert done.returncode == 2
-    done = _run("fit", db, "V001", "absent", "--k", "99")
+    done = _run("fit", db, "V001", "--k", "99")
     assert (
         "V001: k: a reduced basis of this dictionary has 1 to 67 components"
         in done.stderr
     )
-    assert "capture of absent: the database must hold it" in done.stderr
+
+
+@pytest.mark.slow
+def test_fit__an_unknown_take_is_refused_before_others_are_fitted(small_database):
+    _, db = small_database
+    done = _run("fit", db, "V001", "v01", "--explain")
+    assert (done.returncode, done.stdout) == (1, "")
+    said = "capture of v01: the database must hold it; found v01; did you mean V001?"
+    assert said in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -732,14 +740,15 @@ def test_cli__a_failure_is_one_json_object(tmp_path, args, code, what):
 
 
 @pytest.mark.slow
-def test_cli__successes_are_reported_beside_failures(small_database):
-    _, db = small_database
-    done = _run("fit", db, "V001", "nobody", "--explain", "--json")
+def test_cli__successes_are_reported_beside_failures(fitted_database):
+    (fitted_database.root / "log/capture/S02/00000001.json").write_text("{")
+    call = ("fit", fitted_database.url, "S01", "S02", "--dictionary", "embedded")
+    done = _run(*call, "--explain", "--json")
     assert done.returncode == 1
     told = json.loads(done.stdout)
     assert set(told) == {"error", "done"}
-    assert list(told["done"]) == ["V001"]
-    assert "nobody" in told["error"][0]["what"]
+    assert list(told["done"]) == ["S01"]
+    assert "S02" in told["error"][0]["what"]
 
 
 @pytest.mark.slow
@@ -848,6 +857,7 @@ def test_fit_lines__gains_translucency_and_a_model_that_explains_no_photographs(
     with click.Context(click.Command("fit")) as context:
         context.meta["verbose"] = False
         lines = _fit_lines(report)
+    assert lines[0].startswith("fit residual of unobstructed surfels: median ")
     assert (
         any(
             "does not explain the photographs: check the camera poses" in line

@@ -33,6 +33,7 @@ from skindb.cli.shared import (
     summary_of,
 )
 from skindb.cli.terminal import bar, echo
+from skindb.errors import Fault, attempt, require_none
 from skindb.files import Json
 from skindb.parameters import FitParameters
 
@@ -83,6 +84,10 @@ def fit(
     dictionary = shared_path(dictionary)
     # its faults are reported once, before the fits start
     workflow.dictionary_at(dictionary)
+    faults = list[Fault]()
+    for take in sorted({*takes} - {*database.takes("capture")}):
+        attempt(faults, partial(database.record, "capture", take))
+    require_none(faults)
     chosen = takes or workflow.takes_to_fit(
         database, refit=refit, changes=changes, dictionary=dictionary
     )
@@ -156,7 +161,8 @@ def _fit_lines(report: Json) -> list[str]:
     names = ("fit_residual", "held_out_error", "held_out_camera_error")
     errors = {name: report[name] for name in names if name in report}
     lines += [
-        f"{n.replace('_', ' ')}: median {v['median']:.1%}, 95 % {v['p95']:.1%}"
+        f"{n.replace('_', ' ')} of unobstructed surfels: median {v['median']:.1%}, "
+        f"95 % {v['p95']:.1%}"
         for n, v in errors.items()
     ]
     if report.get("fit_residual", {}).get("median", 0) > MAX_RESIDUAL:

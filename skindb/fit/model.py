@@ -381,8 +381,8 @@ def _with_gains(dome: xr.Dataset, gain: Float64) -> xr.Dataset:
 
 
 def _report(fitted: xr.Dataset, held_out: xr.Dataset) -> dict[str, Any]:
-    """Fraction of surfels per status, medians of the errors over area, and held-out
-    lights and cameras.
+    """Fraction of surfels per status, medians of the errors of unobstructed surfels, and
+    held-out lights and cameras.
     """
     status = fitted["fit_status"].values
     skin = status != FitStatus.OBSTRUCTED

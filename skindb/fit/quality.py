@@ -119,7 +119,7 @@ def tabulate_prediction(described: Json) -> list[list[str]]:
         "roots" if space == "perceptual" else samples.replace("held_out_", "unseen ")
         for samples, space in kinds
     ]
-    lines = [["median / 95 % [%]", "surfels", "outliers", *titles]]
+    lines = [["by area: median / 95 % [%]", "surfels", "outliers", *titles]]
     for name, row in rows:
         cells = [row.get(samples, {}).get(space) for samples, space in kinds]
         quantiles = [

@@ -15,7 +15,7 @@ from functools import partial
 from itertools import chain
 from typing import Any
 
-from skindb.errors import Fault, InputError, input_error, require
+from skindb.errors import Fault, InputError, choices, input_error, require
 from skindb.schema.consent import CONSENT, consent_scope
 from skindb.store.entries import (
     Entry,
@@ -131,15 +131,13 @@ class Snapshot:
 
     def _missing_error(self, kind: str, take: str) -> InputError:
         takes = self.takes(kind)
-        finding = f"takes: {', '.join(takes)}"
+        finding = take
+        cure = choices(take, takes)
         if not takes:
             finding = f"no {kind}; kinds: {', '.join(self.kinds()) or 'none'}"
-        return input_error(
-            f"{self.place.name}: {kind} of {take}",
-            "the database must hold it",
-            finding,
-            "see skindb info",
-        )
+            cure = "see skindb info"
+        where = f"{self.place.name}: {kind} of {take}"
+        return input_error(where, "the database must hold it", finding, cure)
 
 
 class Lookup:

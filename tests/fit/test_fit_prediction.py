@@ -140,6 +140,7 @@ def test_tabulate_prediction__shows_only_what_there_is():
     assert described["regions"]["nose"]["fit"]["linear"]["median"] == pytest.approx(0.2)
     assert described["statuses"]["unseen"] == {"surfels": 1, "fraction": 1 / 6}
     header, *rows = tabulate_prediction(described)
+    assert header[0] == "by area: median / 95 % [%]"
     assert header[3:] == ["fit", "roots", "unseen lights", "roots"]
     assert rows[0] == [
         "face",

@@ -570,7 +570,7 @@ def test_stage__names_cannot_leave_the_database(tmp_path, take):
 
 def test_read__absent_take_names_what_exists(tmp_path):
     commit(tmp_path)
-    with pytest.raises(InputError, match="takes: A1"):
+    with pytest.raises(InputError, match="found B2; choose A1"):
         Database(tmp_path).read("capture", "B2")
     with pytest.raises(InputError, match="no model; kinds: capture"):
         Database(tmp_path).read("model", "A1")
