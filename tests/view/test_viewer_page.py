@@ -362,6 +362,10 @@ def test_page__controls_do_what_they_say(browser, page_file):
         page.get_by_role("button", name="Save the picture").click()
     assert saved.value.suggested_filename == "S1.png"
     page.get_by_label("light from all directions").check()
+    page.get_by_label("surface reflection").check()
+    assert pixels(page)[0, 0].max() == 0
+    page.get_by_label("Background").select_option("white")
+    assert pixels(page)[0, 0].min() == 1
     for _ in range(3):
         page.get_by_role("button", name="Remove a light").click()
     canvas.press("Shift+ArrowLeft")  # turns a light, of which there is none now

@@ -109,7 +109,7 @@ class Painter {
     if (!this.face || gl.isContextLost()) return 1;
     this.updateSky(state.around);
     const shown = { lights, sums: null, mirror: state.around.on, coarse: coarse && this.software && this.floats !== null };
-    const asked = JSON.stringify([{ ...state, background: 0 }, width, height, coarse], (key, value) => (key === "inputs" ? 0 : value));
+    const asked = JSON.stringify([state, width, height, coarse], (key, value) => (key === "inputs" ? 0 : value));
     const isSum = state.around.on && state.withSurface && !state.component && this.floats && !coarse;
     if (!isSum || !this.sum || this.sum.asked !== asked) {
       this.clear(null, state.background);
