@@ -558,6 +558,47 @@ def test_page__light_at_fewer_vertices_is_near_that_at_pixels(browser, page_file
     page.close()
 
 
+LAGGING = """([places, edits]) => {
+    const painter = skindb.painter(), {gl, face, sides: {plain, edited}} = painter;
+    const draw = (i, coarse) => {
+        const diffusion = face.diffusion.map((length) => length * (1 + 0.5 * i));
+        if (edits) painter.update({...face, diffusion}, true);
+        else skindb.state.lights[0].position = places[i];
+        painter.draw(skindb.state, coarse);
+        const {frame, width} = (edits ? edited : plain).blurred;
+        const values = new Float32Array(4 * width ** 2);
+        gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+        gl.readPixels(0, 0, width, width, gl.RGBA, gl.FLOAT, values);
+        return [width, values.reduce((sum, value, at) => sum + value * (at % 1000), 0)];
+    };
+    const fresh = (i, coarse) => {
+        plain.glow = edited.glow = {};
+        return draw(i, coarse);
+    };
+    const frames = [0, 1, 2, 3].map((i) => fresh(i, true));
+    const rests = [0, 1, 2, 3].map((i) => fresh(i, false));
+    plain.glow = edited.glow = {};
+    const moving = [0, 1, 2, 3].map((i) => draw(i, true));
+    return [frames, rests, moving, draw(3, false), draw(0, true), draw(1, false)];
+}"""
+
+
+@pytest.mark.parametrize("edits", [False, True])
+def test_page__light_under_the_skin_follows_at_every_other_frame(
+    browser, page_file, edits
+):
+    page = opened(browser, page_file.as_uri())
+    square(page, lights=[lamp([300, 0, 300])], divider=0.5, softness=1)
+    places = [[100.0 * i, 50, 300] for i in range(4)]
+    frames, rests, *drawn = page.evaluate(LAGGING, [places, edits])
+    assert len({total for _, total in frames + rests}) == 8
+    # of this light or edit, then of that before it; at rest it is the present one
+    moving = [frames[0], frames[0], frames[2], frames[2]]
+    assert drawn == [moving, rests[3], frames[0], rests[1]]
+    assert not page.problems
+    page.close()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("view", [(0, 0), (70, -30), (-150, 60)])
 def test_page__triangles_that_are_not_drawn_do_not_change_the_picture(

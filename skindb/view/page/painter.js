@@ -89,7 +89,7 @@ class Painter {
       gl.bufferSubData(gl.ARRAY_BUFFER, 0, values[name]);
     }
     side.values = values;
-    if (changed.some((name) => ["position", "normal", "diffusion"].includes(name))) Object.assign(side, { glow: {}, spread: 0 });
+    if (changed.some((name) => ["position", "normal", "diffusion"].includes(name))) Object.assign(side, { glow: { ...side.glow, lit: "" }, spread: 0 });
     if (!changed.includes("position")) return;
     side.visible = this.isMoved() ? [null, null] : [this.visible, this.coarse];
     side.seen = "";
