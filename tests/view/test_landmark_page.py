@@ -216,7 +216,6 @@ def test_page__points_are_moved_removed_undone_and_accepted(browser, address, he
     page.close()
 
 
-@pytest.mark.slow
 def test_page__works_with_keys_and_shows_the_scans_colours(browser, address):
     page = opened(browser, address, width=860, height=500)
     canvas = page.locator("#canvas")
