@@ -599,6 +599,44 @@ def test_page__light_under_the_skin_follows_at_every_other_frame(
     page.close()
 
 
+def test_page__an_edit_that_moves_leaves_the_other_side_as_it_is(browser, page_file):
+    page = opened(browser, page_file.as_uri())
+    square(page, lights=[lamp([300, 0, 300])], divider=0.5)
+    sides, pictures = page.evaluate(
+        """() => {
+            const painter = skindb.painter(), {drawFace, canvas} = painter;
+            const sides = [], pictures = [];
+            painter.drawFace = function (name, ...given) {
+                sides.push(name);
+                drawFace.call(this, name, ...given);
+            };
+            const draw = (amount, exposure) => {
+                skindb.state.exposure = exposure;
+                skindb.amounts([amount]);
+                painter.draw(skindb.state, true);
+                pictures.push(canvas.toDataURL('image/png'));
+                return sides.splice(0).join();
+            };
+            const steps = [[0, 0.5], [0.5, 0.5], [1, 0.5], [0.5, 0.6], [1, 0.6]];
+            const drawn = steps.map((step) => draw(...step));
+            painter.drawn = '';
+            return [[...drawn, draw(1, 0.6)], pictures];
+        }"""
+    )
+    assert sides == [
+        "plain",
+        "plain,edited",
+        "edited",
+        "plain,edited",
+        "edited",
+        "plain,edited",
+    ]
+    assert len({*pictures[:4]}) == 4
+    assert pictures[4] == pictures[5]
+    assert not page.problems
+    page.close()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("view", [(0, 0), (70, -30), (-150, 60)])
 def test_page__triangles_that_are_not_drawn_do_not_change_the_picture(

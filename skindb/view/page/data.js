@@ -42,7 +42,7 @@ function editedValues(face, amounts) {
   const values = {};
   for (const name of VALUES) {
     const moves = face.traits.map((trait, at) => [trait[name], amounts[at]]).filter(([move, amount]) => move && amount);
-    const out = (values[name] = moves.length ? Float32Array.from(face[name]) : face[name]);
+    const out = (values[name] = moves.length ? face[name].slice() : face[name]);
     const isRatio = name === "albedo" || name === "diffusion", isWeight = name.startsWith("weight");
     for (const [move, amount] of moves)
       for (let i = 0; i < out.length; i++) out[i] = isRatio ? out[i] * Math.exp(amount * move[i]) : out[i] + amount * move[i];

@@ -61,7 +61,9 @@ function redrawMoving() {
 function resize() {
   const canvas = $("canvas"), ratio = Math.min(window.devicePixelRatio || 1, 2) * (moving === null ? 1 : speed.fraction);
   const width = Math.max(Math.round(canvas.clientWidth * ratio), 1), height = Math.max(Math.round(canvas.clientHeight * ratio), 1);
-  if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+  if (canvas.width === width && canvas.height === height) return;
+  Object.assign(canvas, { width, height });
+  painter.drawn = "";
 }
 
 // Turns the face to the other side and back, until something is touched.

@@ -39,7 +39,7 @@ class Painter {
     const gl = this.gl, names = face.traits.length ? ["plain", "edited"] : ["plain"];
     this.shadowed = [];
     this.differ = false;
-    this.sky = "";
+    this.drawn = this.sky = "";
     this.sum = null;
     for (const side of Object.values(this.sides)) {
       gl.deleteVertexArray(side.vao);
@@ -103,7 +103,8 @@ class Painter {
 
   // Draws a picture, or the next part of a picture in an environment; returns the fraction that is done. With
   // `coarse`, while something moves, the environment has a smooth reflection and, without a graphics card, the face has
-  // fewer vertices, at which light is computed, and light under the skin fewer texels.
+  // fewer vertices, at which light is computed, and light under the skin fewer texels; the side before the divider stays
+  // while only the edit changes.
   draw(state, coarse = false) {
     const gl = this.gl, { width, height } = this.canvas, lights = state.lights.slice(0, MAX_LIGHTS);
     if (!this.face || gl.isContextLost()) return 1;
@@ -112,20 +113,28 @@ class Painter {
     const asked = JSON.stringify([state, width, height, coarse], (key, value) => (key === "inputs" ? 0 : value));
     const isSum = state.around.on && state.withSurface && !state.component && this.floats && !coarse;
     if (!isSum || !this.sum || this.sum.asked !== asked) {
-      this.clear(null, state.background);
-      this.drawSides(state, shown);
+      const first = shown.coarse && this.differ && this.drawn === asked ? this.cut(state) : 0;
+      this.clear(null, state.background, first);
+      this.drawSides(state, shown, first);
+      this.drawn = this.differ ? asked : "";
       this.sum = { asked, done: -1 };
       return isSum ? 0 : 1;
     }
     return this.sum.done === batches(this.distant).length ? 1 : this.drawSum(state, shown);
   }
 
-  clear(frame, background) {
-    const gl = this.gl;
+  // column of the divider
+  cut(state) { return this.differ ? Math.round(state.divider * this.canvas.width) : this.canvas.width; }
+
+  clear(frame, background, first = 0) {
+    const gl = this.gl, { width, height } = this.canvas;
     gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
-    gl.viewport(0, 0, this.canvas.width, this.canvas.height);
+    gl.viewport(0, 0, width, height);
+    gl.enable(gl.SCISSOR_TEST);
+    gl.scissor(first, 0, width - first, height);
     gl.clearColor(...(background || [0, 0, 0]), background ? 1 : 0);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    gl.disable(gl.SCISSOR_TEST);
   }
 
   // Adds the reflection of four lights of the environment, and shows the picture when it has all.
@@ -174,13 +183,13 @@ class Painter {
     this.mirror = halfTexture(gl, MIRROR.width, MIRROR.height, gl.FLOAT, mirrorImage(this.distant));
   }
 
-  // Draws both sides of the divider under some lights, into the canvas or added to a sum.
-  drawSides(state, shown) {
+  // Draws the sides of the divider from a column under some lights, into the canvas or added to a sum.
+  drawSides(state, shown, first = 0) {
     const gl = this.gl, { width, height } = this.canvas, { sums, lights } = shown;
     const { uniforms, matrices } = this.lightUniforms(lights, state);
-    const cut = this.differ ? Math.round(state.divider * width) : width;
+    const cut = this.cut(state);
     for (const [name, left, size] of [["plain", 0, cut], ["edited", cut, width - cut]]) {
-      if (size <= 0) continue;
+      if (size <= 0 || left < first) continue;
       if (!state.component) this.drawShadows(matrices, this.isMoved() ? name : "plain", shown.coarse);
       const glow = state.glow && this.floats && state.withDiffuse && !state.component ? this.glow(name, uniforms, shown, state) : null;
       gl.bindFramebuffer(gl.FRAMEBUFFER, sums ? sums.frame : null);
