@@ -3,7 +3,7 @@ command that reproduces them.
 
     python .ci/check_docs.py
 
-Links between pages of the site are checked by Sphinx (`make docs`). This program checks
+Sphinx (`make docs`) checks the links of the site. This program checks
 
 * that pages, changelog, notebooks, help texts, and the comments, docstrings and
   messages of the code and of the tests use common technical terms (`TERMS`);
@@ -12,7 +12,7 @@ Links between pages of the site are checked by Sphinx (`make docs`). This progra
   its options and arguments, and that scripts, tests and make targets in such blocks
   exist;
 * that every section with figures in the pages of results shows a command;
-* that links in README, CHANGELOG and CONTRIBUTING refer to existing files.
+* that links refer to existing files, where pages are read outside the site.
 
 It prints one line for each fault, and its exit code is 1 if there are any. No command
 is run; `check_commands.py` runs the quick ones.
@@ -217,7 +217,7 @@ def skindb_fault(words: list[str]) -> str:
 
 
 def link_faults(page: Path, text: str) -> Iterator[str]:
-    """Links to missing files in pages outside the site; Sphinx checks the pages of the site."""
+    """Links to missing files, also where pages are read outside the site."""
     for match in re.finditer(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text):
         if not (page.parent / match.group(1)).exists():
             yield f"{page.name}: {match.group(1)} does not exist"
@@ -269,7 +269,7 @@ def main() -> int:
             if where.removeprefix("docs/").startswith(RESULTS)
             else []
         )
-        faults += link_faults(page, text) if page.parent == ROOT else []
+        faults += link_faults(page, text)
     sys.stdout.write("".join(f"{fault}\n" for fault in faults))
     sys.stdout.write(
         f"{calls} commands and {len(pages())} pages checked, {len(faults)} faults\n"

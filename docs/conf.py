@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -147,8 +148,14 @@ def _prepare(app: Sphinx) -> None:
     _write_commands()
 
 
+def _link_notebooks(_: Sphinx, page: str, source: list[str]) -> None:  # noqa: ARG001
+    """Links to notebooks lead to the copies, which are one folder below the originals."""
+    source[0] = re.sub(r"\]\(\.\./((?:\.\./)*notebooks/)", r"](\1", source[0])
+
+
 def setup(app: Sphinx) -> None:
     """Copy and generate pages before Sphinx looks for sources."""
     app.add_html_math_renderer("mathml", (_inline, None), (_block, None))
     # before autosummary reads the sources
     app.connect("builder-inited", _prepare, priority=100)
+    app.connect("source-read", _link_notebooks)
