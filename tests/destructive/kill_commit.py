@@ -17,6 +17,7 @@ import shutil
 import signal
 import sys
 import tempfile
+import threading
 from functools import partial
 from pathlib import Path
 
@@ -52,14 +53,16 @@ BROKEN = "broken promise"
 def count_calls(die_at: int) -> list[int]:
     """Count the calls that concern a model from now on, and kill the process at one of them."""
     calls = [0]
+    lock = threading.Lock()  # files are flushed by several threads
 
     def count(event: str, args: tuple[object, ...]) -> None:
         if event in EVENTS and any(
             place in str(arg) for place in PLACES for arg in args[:2]
         ):
-            calls[0] += 1
-            if calls[0] == die_at:
-                os.kill(os.getpid(), signal.SIGKILL)
+            with lock:
+                calls[0] += 1
+                if calls[0] == die_at:
+                    os.kill(os.getpid(), signal.SIGKILL)
 
     def fsync(number: int, call=os.fsync) -> None:  # has no audit event
         count("os.fsync", (Path(f"/proc/self/fd/{number}").readlink(),))

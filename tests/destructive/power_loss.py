@@ -38,6 +38,7 @@ from stored import groups
 
 from skindb.schema import dataset
 from skindb.store import Database
+from skindb.store import folder as folders_of_the_store
 
 CHANGES = ("os.mkdir", "os.link", "os.rename", "os.remove", "os.rmdir", "os.truncate")
 Inode = int
@@ -75,6 +76,8 @@ class Disk:
 
     def start(self) -> None:
         """Record every change from now on."""
+        # the same calls in the same order in every run
+        folders_of_the_store.FLUSHING_THREADS = 1
         self.entries[self.base.stat().st_ino] = {}
         flush = os.fsync
 

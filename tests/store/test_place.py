@@ -103,3 +103,29 @@ def test_sizes__links_and_loops_are_no_files(place):
 def test_remove_version__removes_versions_only(place, path):
     with pytest.raises(InputError, match=r"path of a version: must match|stay inside"):
         remove_version(place, path)
+
+
+def test_make_durable__flushes_every_file_and_folder_up_to_the_root(
+    tmp_path, monkeypatch
+):
+    place = Folder(tmp_path / "db")
+    version = tmp_path / "db/data/A1"
+    for number in range(20):
+        (version / f"v{number}/c/0").mkdir(parents=True)
+        (version / f"v{number}/c/0/1").write_bytes(b"x")
+    flushed = []
+    read = os.readlink
+    monkeypatch.setattr(
+        os, "fsync", lambda number: flushed.append(read(f"/proc/self/fd/{number}"))
+    )
+    place.make_durable("data/A1")
+    expected = {*version.rglob("*"), version, version.parent, place.root, tmp_path}
+    assert {*map(Path, flushed)} == expected
+    assert len(flushed) == len(expected)
+
+    def refused(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", refused)
+    with pytest.raises(OSError, match="No space left"):
+        place.make_durable("data/A1")
