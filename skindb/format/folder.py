@@ -296,11 +296,12 @@ class _Reader:
                     f"the name {short(name)}",
                     "rename it, for example skin_condition",
                 )
-            if name == "age" and not is_number(value):
-                rule = "age must be a number of years"
-                traits.fault(name, rule, shown(value), "write, for example, 31")
-            elif isinstance(value, str):
+            if isinstance(value, str):
                 traits.require_printable(name, value)
+                if name == "age":
+                    self.skipped.append(
+                        f"age: {shown(value)} is no number of years; write, for example, 31"
+                    )
             elif not isinstance(value, bool) and not (
                 is_number(value) and abs(value) <= MAX_MAGNITUDE
             ):
