@@ -50,9 +50,9 @@ MERGES = 3
 # fraction of surfels whose mean weights start a new component, so that no single
 # outlier does
 WORST = 0.02
-# dimensions of the linear space used while searching for H (12 to 16
-# represent 59 BRDFs)
-SPACE = 16
+# dimensions of the linear space used while searching for H; with 16, narrow lobes are
+# not found
+SPACE = 24
 
 
 def reduce_dictionary(

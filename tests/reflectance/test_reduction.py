@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from skindb.reflectance.dictionary import abc_parameters, evaluate_abc
+from skindb.reflectance.dictionary import (
+    abc_parameters,
+    embedded_dictionary,
+    evaluate_abc,
+)
+from skindb.reflectance.mixture import basis_rows
 from skindb.reflectance.reduction import (
     Systems,
     factor_reflectance,
@@ -14,12 +19,28 @@ from skindb.reflectance.reduction import (
     residuals,
     truncation_bound,
 )
-from skindb.reflectance.tables import TableGrid, brdf_metric, tabulate
+from skindb.reflectance.tables import (
+    TableGrid,
+    brdf_metric,
+    directional_albedo,
+    tabulate,
+)
+from skindb.types import dots, unit
 
 GRID = TableGrid(24, 20, 8)
 # of a mixture: tables are single floats, mixed ones sums of terms up to a thousand
 # times their size
 SINGLE = 1e-4
+NARROW = (
+    "ggx 0.04",
+    "ggx 0.15",
+    "ggx 0.9",
+    "black-phenolic",
+    "ggx 0.37",
+    "ggx 0.062",
+    "special-walnut-224",
+    "ggx 0.097",
+)
 
 
 @pytest.fixture(scope="module")
@@ -112,3 +133,42 @@ def test_factor_reflectance__finds_the_planted_basis(noise):
     # the alternation stops 0.2 % short of the truth
     assert error[2] < 1.02 * truth + 2e-3
     assert error[4] <= error[2] + 1e-4
+
+
+def test_factor_reflectance__finds_narrow_lobes():
+    """Each surfel has one of eight BRDFs beside diffuse light, with noise of 1 %. In a
+    space of 16 dimensions, the error was 0.5 % above that of the planted ones.
+    """
+    rng = np.random.default_rng(4)
+    dictionary = embedded_dictionary()
+    index = np.array([dictionary.names.index(name) for name in NARROW])
+    n, lights, cameras = 240, 40, 4
+    normal = unit(rng.normal(size=(n, 3)) * [0.6, 0.6, 0.3] + [0, 0, 1])
+    to_light, to_camera = (
+        unit(
+            unit(rng.normal(size=(count, 3)) * [1, 1, 0.5] + [0, 0, 0.7]) * 900
+            - 80 * normal[:, None]
+        )
+        for count in (lights, cameras)
+    )
+    rows, offsets, pair = basis_rows(
+        dictionary.table,
+        dictionary.grid,
+        normal,
+        to_light,
+        to_camera,
+        np.ones((n, lights, cameras), bool),
+    )
+    surfel = np.repeat(np.arange(n), np.diff(offsets))
+    own = index[surfel % len(index)]
+    albedo = directional_albedo(dictionary.table, 1.0)[0]
+    gloss = 0.04 * rows[np.arange(len(rows)), own] / albedo[own]
+    matte = 0.08 * dots(normal[surfel], to_light[surfel, pair[:, 0]])
+    samples = np.repeat((gloss + matte)[:, None], 3, axis=1)
+    samples *= 1 + 0.01 * rng.normal(size=samples.shape)
+    noise = np.hypot(0.001, 0.02 * samples.mean(axis=1))[:, None]
+    systems = Systems.of(rows / noise, offsets, samples / noise, matte[:, None] / noise)
+    planted = np.eye(len(dictionary.names))[index]
+    found = factor_reflectance(systems, len(index))[-1]
+    error, truth = (np.sqrt(residuals(systems, H)[1].sum()) for H in (found, planted))
+    assert error < 1.002 * truth  # 1.0000 measured
