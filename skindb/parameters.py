@@ -453,6 +453,9 @@ class SimulationParameters(Limited):
     polarised
         Circular polarisers before the lights and cameras, see
         `skindb.virtual.dome.build_dome`.
+    bases
+        Number of BRDFs of which each patch of skin reflects one alone, instead of
+        mixtures: at most four in a take, of which two differ in conditions other than normal.
     seed
         Random seed of the noise; shapes and skins depend on the people alone.
     """
@@ -473,6 +476,13 @@ class SimulationParameters(Limited):
     polarised: bool = option(
         False,
         "Circular polarisers, crossed in every other camera and parallel in the rest.",
+    )
+    bases: int | None = option(
+        None,
+        "Number of BRDFs of which each patch of skin reflects one alone.  "
+        "[default: mixtures]",
+        minimum=1,
+        maximum=8,
     )
     seed: int = seed_option("noise", VIRTUAL_SEED)
 

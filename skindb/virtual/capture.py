@@ -56,7 +56,7 @@ from skindb.virtual.dome import (
 from skindb.virtual.head import Head, parametric_head
 from skindb.virtual.person import Person, default_people, face_shape
 from skindb.virtual.probe import ProbeTruth, write_probe
-from skindb.virtual.skin import MATERIALS, Skin, skin_of, smooth_noise
+from skindb.virtual.skin import MATERIALS, Skin, materials_of, skin_of, smooth_noise
 
 # mm along the normal of the scan within which the true surface is searched
 SEARCH = 5.0
@@ -246,7 +246,8 @@ def simulate_take(
             progress(f"simulate {person.take}", next(steps), total)
 
     geometry_rng, frame_rng, probe_rng = rng.spawn(3)
-    dictionary, albedo = _materials()
+    names = materials_of(person)
+    dictionary, albedo = _materials(names)
     head, scan = _heads(person, spacing_mm, geometry_rng)
     skin = skin_of(head, person, material_albedo=albedo, eta=eta)
     report()
@@ -272,7 +273,7 @@ def simulate_take(
         step=report,
     )
     _dump(out / "dome" / "dome.json", dome_record(dome, sensor, session_time(person)))
-    _write_truth(out, head, skin, probe, dome, eta=eta, subsurface=subsurface)
+    _write_truth(out, head, skin, names, probe, dome, eta=eta, subsurface=subsurface)
     # written last, as a folder without it is incomplete
     _dump(
         out / "capture.json",
@@ -294,16 +295,16 @@ def _require_empty(out: Path) -> None:
 
 
 @cache
-def _materials() -> tuple[Dictionary, Float64]:
+def _materials(names: tuple[str, ...] = MATERIALS) -> tuple[Dictionary, Float64]:
     """Materials of the true surface for the dome's lights, and their directional albedo
     at normal incidence.
     """
     embedded = embedded_dictionary()
-    index = [embedded.names.index(name) for name in MATERIALS]
+    index = [embedded.names.index(name) for name in names]
     table = np.ascontiguousarray(embedded.table[..., index])
     # the tables are convolved with the disc of the lights: one ray per pixel and light is enough
     disc = convolve_disc(
-        replace(embedded, names=MATERIALS, table=table, exact=0),
+        replace(embedded, names=names, table=table, exact=0),
         DISC_RADIUS / LIGHT_RADIUS,
     )
     return disc, directional_albedo(table, np.ones(1))[0]
@@ -364,6 +365,7 @@ def _write_truth(
     out: Path,
     head: Head,
     skin: Skin,
+    names: tuple[str, ...],
     probe: ProbeTruth | None,
     dome: Dome,
     *,
@@ -378,7 +380,7 @@ def _write_truth(
         values = [getattr(site, name) for site in skin.sites]
         touched[f"site_{name}"] = np.array(values).reshape(-1, 3)
     abc = abc_parameters()  # lobes are not in it, and reflect nothing evenly
-    lambertian = [np.mean(abc[x][:3]) if x in abc else 0.0 for x in MATERIALS]
+    lambertian = [np.mean(abc[x][:3]) if x in abc else 0.0 for x in names]
     np.savez(
         private_file(out.with_name(out.name + ".truth.npz")),
         vertices=head.vertices,
@@ -386,7 +388,7 @@ def _write_truth(
         normals=head.normals,
         diffuse_reflectance=skin.diffuse,
         surface_weights=skin.weights,
-        surface_names=np.array(MATERIALS),
+        surface_names=np.array(names),
         surface_bases=skin.bases,
         gloss_causes=np.array([*skin.gloss]),
         gloss_factors=np.array([*skin.gloss.values()]),
@@ -445,7 +447,7 @@ def simulate_takes(
     folders = []
     everybody = default_people() if people is None else people
     for i in range(len(everybody))[:takes] if isinstance(takes, int) else takes:
-        person = everybody[i]
+        person = replace(everybody[i], bases=settings.bases)
         folders.append(out / person.take)
         simulate_take(
             folders[-1],

@@ -38,6 +38,7 @@ class Person:
     blood: float = 0.0  # standard deviations
     fullness: float = 0.5  # of the cheeks, 0 to 1
     visit: int | None = None  # None if there is only one
+    bases: int | None = None  # see `skindb.parameters.SimulationParameters`
 
     def __post_init__(self) -> None:
         for value, allowed, name in (

@@ -34,6 +34,19 @@ MATERIALS = (
 SHARP = [1, 3]  # of BASES
 # of one person, as in the paper; six in all conditions, eight in a population
 BASES = 4
+# those of the dictionary that an exact fit with noise of 1 % distinguishes best, the most
+# different first; see benchmarks/planted_bases.py
+DISTINCT = (
+    "ggx 0.097",
+    "black-phenolic",
+    "blue-fabric",
+    "ggx 0.15",
+    "ggx 0.04",
+    "ggx 0.37",
+    "pearl-paint",
+    "ggx 0.58",
+)
+PATCHES = 80  # with one of DISTINCT each
 MIDDLE_AGE = 40.0  # years, at which age has no effect on gloss
 MIX_SPREAD = 0.3  # between people, of the fraction of the second material of a pair
 WAVES = 40  # of `smooth_noise`
@@ -159,8 +172,8 @@ class Skin:
     """True parameters per vertex."""
 
     diffuse: Float64  # (n, 3) R_d
-    weights: Float64  # (n, k) of MATERIALS
-    bases: Float64  # (BASES, k) fractions of MATERIALS, by albedo
+    weights: Float64  # (n, k) of `materials_of` the person
+    bases: Float64  # (BASES, k) fractions of the materials, by albedo
     gloss: dict[str, float]  # factors on the specular albedo, by what causes them
     sigma_tr: Float64  # (n, 3) mm^-1
     sites: tuple[Site, ...]
@@ -178,7 +191,8 @@ def skin_of(
     person
         Age, gender, ancestry, condition and individual variation.
     material_albedo
-        Directional albedo (k,) of MATERIALS at normal incidence, by which the weights are scaled.
+        Directional albedo (k,) of `materials_of` the person at normal incidence, by which
+        the weights are scaled.
     eta
         Index of refraction for the conversion of (R_d, sigma_tr) of the sites to
         sigma_a and sigma_s'.
@@ -194,6 +208,8 @@ def skin_of(
     }
     bases = _bases(person, effect)
     albedo, fractions = _surface(head, person, effect)
+    if person.bases:
+        bases, fractions = _patches(head, person, person.bases)
     albedo = albedo * np.prod([*gloss.values()])
     return Skin(
         diffuse,
@@ -304,6 +320,25 @@ def _bases(person: Person, effect: ConditionEffect) -> Float64:
     bases *= 1 - effect.film - effect.powder
     bases[:, -2:] += effect.film, effect.powder
     return bases
+
+
+def materials_of(person: Person) -> tuple[str, ...]:
+    """Names of the BRDFs of which a person's bases are mixtures."""
+    return DISTINCT[: person.bases] if person.bases else MATERIALS
+
+
+def _patches(head: Head, person: Person, count: int) -> tuple[Float64, Float64]:
+    """Bases, each one of `count` BRDFs, and their fractions, 1 or 0, at the vertices: four
+    BRDFs in a condition, of which two differ in conditions other than normal.
+    """
+    rng = person.stream(8)
+    order = rng.permutation(count)
+    if person.condition != "normal":
+        order = np.roll(order, -2)
+    order = order[:BASES]
+    centres = rng.choice(head.vertices, PATCHES)
+    patch = cKDTree(centres).query(head.vertices)[1]
+    return np.eye(count)[order], np.eye(len(order))[patch % len(order)]
 
 
 def _surface(

@@ -59,7 +59,7 @@ def simulate(
         in this process.
     **options
         Of `skindb.parameters.SimulationParameters`: cameras, lights, width, height,
-        subsurface, polarised, seed.
+        subsurface, polarised, bases, seed.
 
     Returns
     -------

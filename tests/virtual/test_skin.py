@@ -97,6 +97,22 @@ def test_skin_of__one_person_has_four_bases_all_conditions_six_a_population_eigh
     assert np.linalg.matrix_rank(np.vstack(weights)) == 8
 
 
+def test_skin_of__each_vertex_has_one_planted_brdf(head):
+    """Four of the planted BRDFs in a take, six in conditions of a person, all in a population,
+    each on a fair fraction of the surface.
+    """
+    of_one = [replace(PERSON, bases=8, condition=c) for c in ("normal", "lotion")]
+    fractions = []
+    for person in of_one:
+        skin = skin_of(head, person, material_albedo=ALBEDO, eta=1.3)
+        assert ((skin.weights > 0).sum(axis=1) == 1).all()
+        fractions.append((skin.weights > 0).mean(axis=0))
+    fractions = np.array(fractions)
+    assert ((fractions > 0.15).sum(axis=1) == 4).all()
+    assert fractions[fractions > 0].max() < 0.35
+    assert (fractions > 0).any(axis=0).sum() == 6
+
+
 def test_skin_of__gloss_has_the_stated_factors(head):
     base = _skin(head, replace(PERSON, age=40))
     changed = replace(PERSON, age=65, ancestry="african", condition="lotion")

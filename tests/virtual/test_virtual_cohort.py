@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from skindb.errors import InputError
+from skindb.parameters import SimulationParameters
 from skindb.virtual.capture import capture_record, session_time
 from skindb.virtual.person import VISIT_BLOOD, VISIT_MELANIN, cohort_people
+from skindb.virtual.skin import DISTINCT
 from skindb.workflow import simulate
 
 SIZE = {"cameras": 2, "lights": 12, "width": 24, "height": 30}
@@ -111,3 +113,16 @@ def test_simulate__spares_a_folder_that_holds_no_cohort(tmp_path):
     ):
         simulate(tmp_path, cohort=1, **SIZE)
     assert (tmp_path / "P001").is_dir()
+
+
+def test_simulate__truth_has_each_planted_brdf_alone(tmp_path):
+    simulate(tmp_path, takes=1, bases=2, **SIZE)
+    with np.load(tmp_path / "V001.truth.npz") as truth:
+        assert tuple(truth["surface_names"]) == DISTINCT[:2]
+        assert ((truth["surface_weights"] > 0).sum(axis=1) == 1).all()
+
+
+def test_simulate__can_plant_every_distinct_brdf():
+    SimulationParameters(bases=len(DISTINCT))
+    with pytest.raises(InputError, match="bases"):
+        SimulationParameters(bases=len(DISTINCT) + 1)
