@@ -534,7 +534,7 @@ def test_read_capture__refuses_attributes_that_imitate_columns(capture_folder):
     ]
     record = json.loads((capture_folder / C).read_text())
     record["traits"] = dict.fromkeys(
-        [*names, "skin_condition", "age", "fitness", "sessions"], "x"
+        [*names, "skin_condition", "age_group", "fitness", "sessions"], "x"
     )
     (capture_folder / C).write_text(json.dumps(record))
     with pytest.raises(
