@@ -2,9 +2,9 @@
 "use strict";
 
 class VisibleTriangles {
-  constructor({ position, triangles }) {
+  constructor({ position, triangles, corners = Uint32Array.from(new Set(triangles)) }) {
     const count = triangles.length / 3;
-    Object.assign(this, { position, triangles, planes: new Float32Array(4 * count), chosen: new Uint32Array(triangles.length), corners: Uint32Array.from(new Set(triangles)) });
+    Object.assign(this, { position, triangles, corners, planes: new Float32Array(4 * count), chosen: new Uint32Array(triangles.length) });
     this.across = new Float32Array(position.length / 3);  // horizontal place in the picture, from -1 to 1
     const { planes } = this;
     for (let i = 0; i < count; i++) {
