@@ -653,7 +653,7 @@ def test_page__triangles_that_are_not_drawn_do_not_change_the_picture(
         """() => {
             const painter = skindb.painter(), {triangles} = painter.face;
             const sides = Object.values(painter.sides);
-            const drawn = sides.map((side) => side.size);
+            const drawn = sides.map((side) => side.list.count);
             painter.visible.select = () => triangles;
             sides.forEach((side) => { side.seen = ''; });
             return [drawn, triangles.length];

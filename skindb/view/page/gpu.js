@@ -127,11 +127,10 @@ function buffer(gl, location, size, values) {
 }
 
 // numbers of vertices, for `drawIndices`
-function indices(gl, values) {
-  const made = gl.createBuffer();
+function indices(gl, values, made = gl.createBuffer()) {
   gl.bindVertexArray(null);
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, made);
-  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, values, gl.STATIC_DRAW);
+  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, values, gl.DYNAMIC_DRAW);
   return { buffer: made, count: values.length };
 }
 

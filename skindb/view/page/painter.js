@@ -74,9 +74,10 @@ class Painter {
       ...VALUES.map((name, at) => buffer(gl, at, name.startsWith("weight") ? 4 : 3, face[name])),
       buffer(gl, 6, 2, face.uv), buffer(gl, 7, 1, face.spacing), buffer(gl, 8, 2, face.quality), buffer(gl, 9, 16, face.transfer),
     ];
-    const index = indices(gl, face.triangles);
-    const list = gl.createBuffer();  // of the visible triangles, made again for each view
-    return { vao, buffers: [...buffers, index.buffer, list], index, list, visible: [this.visible, this.coarse], values: face, seen: "", size: 0, glow: {}, spread: 0 };
+    const index = indices(gl, face.triangles), none = new Uint32Array();
+    const list = indices(gl, none), points = indices(gl, none);  // what the view shows
+    for (const one of [index, list, points]) buffers.push(one.buffer);
+    return { vao, buffers, index, list, points, visible: [this.visible, this.coarse], values: face, seen: "", glow: {}, spread: 0 };
   }
 
   // Changes the values of the edited side; `differ` is whether it differs from the plain one.
@@ -335,25 +336,25 @@ class Painter {
       linear: ["1i", sums ? 1 : 0], toned: ["1i", state.toned ? 1 : 0], component: ["1i", state.component],
     };
     const side = this.sides[name], atVertices = coarse && !state.component, many = face.tableB ? "OfMany" : "";
+    this.selectVisible(side, eye, matrix, span, coarse);
     gl.bindVertexArray(side.vao);
-    if (atVertices) this.drawLight(this.programs[`light${many}`], values);
+    if (atVertices) this.drawLight(this.programs[`light${many}`], values, side.points);
     gl.enable(gl.DEPTH_TEST);
     gl.enable(gl.CULL_FACE);
     setUniforms(gl, this.programs[state.component ? "components" : atVertices ? "coarse" : `face${many}`], values);
-    this.selectVisible(side, eye, matrix, span, coarse);
-    gl.drawElements(gl.TRIANGLES, side.size, gl.UNSIGNED_INT, 0);
+    drawIndices(gl, gl.TRIANGLES, side.list);
     gl.bindVertexArray(null);
   }
 
   // Computes the radiance of the vertices that are drawn while something moves, into a texture for the program `coarse`.
   // Each is computed once, but pixels of triangles of their size several times without a graphics card.
-  drawLight(program, values) {
+  drawLight(program, values, points) {
     const gl = this.gl, { frame, texture, width, height } = this.light;
     gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
     gl.viewport(0, 0, width, height);
     for (const one of [gl.DEPTH_TEST, gl.CULL_FACE, gl.SCISSOR_TEST]) gl.disable(one);
     setUniforms(gl, program, { ...values, size: ["2iv", [width, height]] });
-    drawIndices(gl, gl.POINTS, this.points);
+    drawIndices(gl, gl.POINTS, points);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, this.canvas.width, this.canvas.height);
     gl.enable(gl.SCISSOR_TEST);
@@ -361,14 +362,16 @@ class Painter {
     gl.bindTexture(gl.TEXTURE_2D, texture);
   }
 
-  // binds the list of the triangles of a side that the view shows
+  // lists the triangles of a side that the view shows, and their vertices for `drawLight`
   selectVisible(side, eye, matrix, span, coarse) {
     const gl = this.gl, asked = [...matrix, ...span, coarse].join(), which = coarse ? 1 : 0;
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, side.list);
     if (side.seen === asked) return;
+    side.seen = asked;
     side.visible[which] = side.visible[which] || new VisibleTriangles({ ...this[coarse ? "coarse" : "visible"], position: side.values.position });
-    const list = side.visible[which].select(eye, matrix, ...span);
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, list, gl.DYNAMIC_DRAW);
-    Object.assign(side, { seen: asked, size: list.length });
+    const list = side.visible[which].select(eye, matrix, ...span), shown = new Uint8Array(this.face.spacing.length);
+    side.list = indices(gl, list, side.list.buffer);
+    if (!coarse) return;
+    for (const i of list) shown[i] = 1;
+    side.points = indices(gl, this.coarse.corners.filter((i) => shown[i]), side.points.buffer);
   }
 }

@@ -340,7 +340,7 @@ void main() {
 }`,
   },
 
-  // radiance of the vertices that face the eye, each at a texel of its own
+  // radiance of the vertices that the view shows, each at a texel of its own
   light: {
     vertex: COMMON + `
 #define AT_VERTICES
@@ -352,7 +352,7 @@ void main() {
   setSurfel();
   gl_PointSize = 1.0;
   gl_Position = vec4((vec2(gl_VertexID % size.x, gl_VertexID / size.x) + 0.5) / vec2(size) * 2.0 - 1.0, 0.0, 1.0);
-  vRadiance = dot(normal, normalize(eye - position)) < -0.5 ? vec3(0.0) : radiance(normal, albedo);
+  vRadiance = radiance(normal, albedo);
 }`,
     fragment: `#version 300 es
 precision highp float;
