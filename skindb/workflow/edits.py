@@ -32,6 +32,7 @@ GRID_SIDE = 320.0  # pixels, the longer side of a picture in a grid
 SAMPLES = 4  # rays per pixel of such a picture, of few lights
 LABEL_WIDTH = 26  # characters
 METHOD = (apply_traits, common_maps)  # functions that compute an edit
+TRAITS = "traits"  # method of the study of an edit
 STRENGTHS = (0.5, 1.0)  # of the edits in a grid, as in figure 19 of the paper
 
 
@@ -261,7 +262,7 @@ def editable_model(
     db: Database, take: str, study: str | None, dictionary: Path | None
 ) -> Editable:
     """A model of a database with what moves it along the traits of a study."""
-    study = _trait_study(db, study)
+    study = stored_study(db, TRAITS, study)
     inputs = [db.record("model", take), db.record(STUDY, study)]
     model, vectors = map(db.version, inputs)
     db.require_consent(take, "statistics")
@@ -319,15 +320,16 @@ def _registered_textures(
     return arguments, [records[take]]
 
 
-def _trait_study(db: Database, name: str | None) -> str:
-    """What the study of traits that an edit uses is stored as."""
-    stored = [name for name in db.takes(STUDY) if name.partition(".")[0] == "traits"]
-    study = name or (stored[0] if len(stored) == 1 else "traits")
+def stored_study(db: Database, method: str, name: str | None = None) -> str:
+    """What a study of traits or components is stored as; by default `method`, or the only one."""
+    stored = [study for study in db.takes(STUDY) if study.partition(".")[0] == method]
+    study = name or (stored[0] if len(stored) == 1 else method)
+    cure = f"run: skindb analyze DB {method}"
     require(
         study in stored,
         f"study {study}",
-        "must be a study of traits in the database",
-        f"studies of traits: {', '.join(stored) or 'none'}",
-        "name one of them with --study" if stored else "run: skindb analyze DB traits",
+        f"must be a study of {method} in the database",
+        f"studies of {method}: {', '.join(stored) or 'none'}",
+        "name one of them with --study" if stored and method == TRAITS else cure,
     )
     return study

@@ -45,7 +45,7 @@ from skindb.view.page import (
 )
 from skindb.workflow.audit import logged
 from skindb.workflow.cohorts import current_registrations, registered_datasets
-from skindb.workflow.edits import editable_model
+from skindb.workflow.edits import editable_model, stored_study
 
 SIDE_PX = 320  # of a picture
 CLOSE_MM = 40.0  # side of a close-up
@@ -511,10 +511,11 @@ def _along_modes(
     if not count:
         return ()
     db.require_consent(take, "statistics")
-    faces = db.read(STUDY, COMPONENTS)["face_model"].to_dataset().load()
+    study = stored_study(db, COMPONENTS)
+    faces = db.read(STUDY, study)["face_model"].to_dataset().load()
     for note in privacy_notes(faces):
         warnings.warn(f"study of components: {note}", SkindbWarning, stacklevel=2)
-    require_fresh(db, STUDY, COMPONENTS)
+    require_fresh(db, STUDY, study)
     records = current_registrations(db, [take])
     require(records, take, "must be registered", "none", "run: skindb register DB")
     registered = registered_datasets(db, records)[take]

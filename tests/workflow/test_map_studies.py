@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,9 +16,10 @@ from skindb import workflow
 from skindb.analysis import describe_study, tabulate_study
 from skindb.analysis.studies import STUDIES
 from skindb.cli import cli
-from skindb.errors import SkindbWarning
+from skindb.errors import InputError, SkindbWarning
 from skindb.store import Database
 from skindb.workflow import pictures
+from skindb.workflow.edits import stored_study
 from skindb.workflow.pictures import _along_modes
 from skindb.workflow.studies import open_population
 from skindb.workflow.upkeep import repeat_study
@@ -116,6 +118,17 @@ def test_along_modes__are_edits_of_the_take(database, monkeypatch):
     expected = np.sqrt(8 / 7) * np.log(0.5 / (0.5 - STEP))
     assert float(np.abs(whole.median())) == pytest.approx(expected, rel=0.05)
     np.testing.assert_allclose(half, whole / 2, atol=1e-5)
+
+
+def test_stored_study__is_the_only_one_of_its_method():
+    stored = ["components.k-3", "traits", "traits.k-4"]
+    db = SimpleNamespace(takes=lambda _: stored)
+    assert stored_study(db, "components") == "components.k-3"
+    assert stored_study(db, "traits") == "traits"
+    assert stored_study(db, "traits", "traits.k-4") == "traits.k-4"
+    stored += ["components.k-5"]
+    with pytest.raises(InputError, match="run: skindb analyze DB components"):
+        stored_study(db, "components")
 
 
 def test_correlations__channels_go_together(database):
