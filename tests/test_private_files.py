@@ -201,7 +201,7 @@ def test_cli__what_libraries_write_is_private(monkeypatch):
     monkeypatch.setattr("sys.argv", ["skindb", "info", "db"])
     seen = []
 
-    def look(_):
+    def look(_, **__):
         seen.append(os.umask(0o077))
         raise SystemExit
 

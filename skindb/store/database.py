@@ -675,7 +675,7 @@ def open(  # noqa: A001  as in xarray and zarr
         db.url,
         "the database must exist",
         "nothing",
-        "correct the path, or ingest a capture into it first",
+        "ingest a capture into it first",
     )
     entries = set(names or ())
     # a bucket without records has no log
