@@ -13,15 +13,15 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile -m "not slow"
 
-# what pages state (the schema, words, the README's commands, with `make demo`), every test, then the commands
+# every test and what pages state (the schema, words, the README's commands, with `make demo`), then the commands
 # of the other pages, the notebooks and the site
 test-all: $(STAMP)
-	$(MAKE) --jobs 2 --output-sync=target readme pages
-	$(MAKE) suite
+	$(MAKE) --jobs 3 --output-sync=target readme pages suite
 	$(MAKE) --jobs 2 --output-sync=target commands notebooks
 
+# one process more than processors, as tests wait for servers, devices and killed processes
 suite: $(STAMP)
-	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder --durations 40
+	$(BIN)/python -m pytest --numprocesses $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder --durations 40
 
 pages: $(STAMP)
 	$(BIN)/python docs/make_variables.py --check
