@@ -34,7 +34,7 @@ MATERIALS = (
 SHARP = [1, 3]  # of BASES
 # of one person, as in the paper; six in all conditions, eight in a population
 BASES = 4
-# those of the dictionary that an exact fit with noise of 1 % distinguishes best, the most
+# of the dictionary, which an exact fit with noise of 1 % tells apart, the most
 # different first; see benchmarks/planted_bases.py
 DISTINCT = (
     "ggx 0.097",
