@@ -12,7 +12,6 @@ from typing import BinaryIO
 
 import numpy as np
 from scipy.spatial import cKDTree
-from trimesh.exchange.ply import load_ply
 
 from skindb.errors import Fault, InputError, input_error, require_none
 from skindb.files import open_regular
@@ -132,6 +131,9 @@ def _faults(file: str, vertices: Array, faces: Index) -> list[Fault]:
 
 def _read_ply(stream: BinaryIO) -> Scan:
     _require_counts(stream)
+    # takes longer to import than most commands run
+    from trimesh.exchange.ply import load_ply
+
     # fix_texture would split vertices along texture seams and so renumber them
     content = load_ply(stream, fix_texture=False, skip_materials=True)
     vertices = float64(content.get("vertices", np.zeros((0, 3))))

@@ -83,6 +83,7 @@ MAX_THREADS = 8
 # 52 to 58 % of R_d at points are within one standard error, of R_d over a pixel 66 to 72 %
 COARSE_PIXEL = 1.5
 MAX_BYTES = 4 << 30  # of memory for all threads together, unless two threads need more
+LARGE = 100_000  # surfels of a take whose freed memory is worth a search
 
 
 @contextmanager
@@ -160,10 +161,11 @@ def ingest_capture(
         run.require_no_faults()
         tree = xr.DataTree.from_dict(run.groups)
         tree.attrs = run.attributes()
-        # what was freed, which the C library would keep while samples are written
-        gc.collect()
-        with suppress(AttributeError):  # of glibc
-            ctypes.CDLL(None).malloc_trim(0)
+        if len(surfels.position) > LARGE:
+            # what was freed, which the C library would keep while samples are written
+            gc.collect()
+            with suppress(AttributeError):  # of glibc
+                ctypes.CDLL(None).malloc_trim(0)
         stack.enter_context(
             dask.config.set(scheduler="threads", num_workers=threads(capture.dome))
         )

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
-from scipy.stats import quantile
 
 from skindb.ingest._sample_kernels import (
     FLOOR,
@@ -228,7 +227,9 @@ def surfel_albedo(
             ratio /= max(float(np.nanmedian(ratio)), FLOOR)
     measured = np.isfinite(ratios).any(axis=0)
     albedo = np.ones(ratios.shape[1])
-    # `np.nanquantile` makes a call for each column
+    # `np.nanquantile` makes a call for each column; most commands do without this import
+    from scipy.stats import quantile
+
     albedo[measured] = quantile(
         ratios[:, measured], ALBEDO_QUANTILE, axis=0, nan_policy="omit"
     )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from skindb.calibration.fibres import place_text, placement_signal
 from skindb.errors import Fault, InputError, attempt, input_error, require, require_none
@@ -79,7 +79,7 @@ def decay_p_values(value: Float64, error: Float64, distance: Float64) -> Float64
     variance = (factor**2 * sigma**2).sum(axis=1)
     level = np.average(slope, axis=0, weights=1 / variance)
     chi_square = ((slope - level) ** 2 / variance).sum(axis=0)
-    return stats.chi2.sf(chi_square, len(value) - 1)
+    return special.chdtrc(len(value) - 1, chi_square)
 
 
 @dataclass(frozen=True)

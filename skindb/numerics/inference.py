@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from numpy.random import Generator
-from scipy import stats
+from scipy import special
 
 from skindb.numerics.statistics import CONFIDENCE, ROUNDING, Moments
 from skindb.types import AnyArray, Array, Index, Mask, finite_rows, float64, lengths
@@ -188,7 +188,7 @@ def known_effects(slope: Array, error: Array) -> Effects:
 
 
 def _effects(slope: Array, error: Array, spread: Array, freedom: Array) -> Effects:
-    half = stats.t.ppf((1 + CONFIDENCE) / 2, freedom) * error
+    half = special.stdtrit(freedom, (1 + CONFIDENCE) / 2) * error
     statistic = np.where(np.isnan(slope), np.nan, _ratio(slope, error))
     return Effects(slope, error, slope - half, slope + half, statistic, spread, freedom)
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from skindb.types import AnyArray, Array, float64
 
@@ -85,7 +85,7 @@ class Moments:
 
     def mean_interval(self) -> tuple[Array, Array]:
         """Student's interval of the mean; NaN for fewer than two values."""
-        half = stats.t.ppf((1 + CONFIDENCE) / 2, np.maximum(self.count - 1.0, 1.0))
+        half = special.stdtrit(np.maximum(self.count - 1.0, 1.0), (1 + CONFIDENCE) / 2)
         half = half * self.standard_deviation / np.sqrt(np.maximum(self.count, 1.0))
         return self.mean - half, self.mean + half
 
@@ -121,7 +121,9 @@ def detectable_difference(error: Array, free: Array | float) -> Array:
     """Smallest effect that a test at the level of 5 % detects with a power of 80 %, from
     the standard error of its estimate and its degrees of freedom.
     """
-    quantiles = stats.t.ppf((1 + CONFIDENCE) / 2, free) + stats.t.ppf(POWER, free)
+    quantiles = special.stdtrit(free, (1 + CONFIDENCE) / 2) + special.stdtrit(
+        free, POWER
+    )
     return error * quantiles
 
 
@@ -147,8 +149,8 @@ def intraclass_correlation(values: Array, subject: AnyArray) -> OneWay:
     between = float(count @ (mean - values.mean()) ** 2) / (people - 1)
     within = float(((values - mean[member]) ** 2).sum()) / (n - people)
     size = (n - float(count @ count) / n) / (people - 1)
-    upper = stats.f.ppf((1 + CONFIDENCE) / 2, people - 1, n - people)
-    lower = stats.f.ppf((1 + CONFIDENCE) / 2, n - people, people - 1)
+    upper = special.fdtri(people - 1, n - people, (1 + CONFIDENCE) / 2)
+    lower = special.fdtri(n - people, people - 1, (1 + CONFIDENCE) / 2)
     # ratios of the mean squares between and within subjects, times the latter
     squares = (between, between / upper, between * lower)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -176,8 +178,8 @@ def agreement_correlation(values: Array) -> tuple[float, float, float]:
         free = (a * occasion + b * error) ** 2 / (
             (a * occasion) ** 2 / (k - 1) + (b * error) ** 2 / ((n - 1) * (k - 1))
         )
-        upper = stats.f.ppf((1 + CONFIDENCE) / 2, n - 1, free)
-        lower = stats.f.ppf((1 + CONFIDENCE) / 2, free, n - 1)
+        upper = special.fdtri(n - 1, free, (1 + CONFIDENCE) / 2)
+        lower = special.fdtri(free, n - 1, (1 + CONFIDENCE) / 2)
         others = k * occasion + (k * n - k - n) * error
         low = n * (between - upper * error) / (upper * others + n * between)
         high = n * (lower * between - error) / (others + n * lower * between)

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates, spline_filter
@@ -292,6 +291,10 @@ def subdivide_surface(surface: Surface, spacing: float, values: Array) -> Surfac
     values
         (v, c) values of the vertices; triangles with NaN are not divided.
     """
+    from trimesh.remesh import (
+        subdivide,
+    )  # takes longer to import than most commands run
+
     names = [
         name
         for name in ("normals", "diffuse", "parameters", "s", "sigma_tr", "uv")
@@ -308,7 +311,7 @@ def subdivide_surface(surface: Surface, spacing: float, values: Array) -> Surfac
         chosen = np.flatnonzero((apart > 1) & (longest > spacing))
         if not len(chosen) or len(vertices) + 3 * len(chosen) > MAX_VERTICES:
             break
-        vertices, faces, attributes = trimesh.remesh.subdivide(
+        vertices, faces, attributes = subdivide(
             vertices, faces, chosen, vertex_attributes=attributes
         )
     attributes.pop("values")

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 import xarray as xr
 from scipy.spatial.transform import Rotation
 
@@ -234,7 +233,9 @@ def _without_scan(capture: Path) -> list[Path]:
 
 def _write(folder: Path, scan: Scan, points: dict[str, Float64], matrix: Array) -> None:
     """Write the moved scan and landmarks."""
-    mesh = trimesh.Trimesh(
+    from trimesh import Trimesh  # takes longer to import than most commands run
+
+    mesh = Trimesh(
         moved(matrix, scan.vertices),
         scan.faces,
         vertex_colors=scan.colours,
