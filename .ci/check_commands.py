@@ -12,15 +12,15 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
 import sys
-import tempfile
-from contextlib import chdir
+import traceback
+from contextlib import chdir, redirect_stdout
+from io import StringIO
 from pathlib import Path
-from shutil import copytree
 
 from check_docs import ROOT, commands, pages
 from click.testing import CliRunner
+from demo_copy import demo_copy
 
 from skindb.cli import cli
 from skindb.virtual.targets import write_laboratory
@@ -75,22 +75,26 @@ def calls() -> list[list[str]]:
                 found["skindb", *(TAKES.get(word, word) for word in words[1:])] = None
         for block in re.findall(r"^```python\n(.*?)^```", text, re.S | re.M):
             if 'skindb.open("demo/db")' in block:
-                found[sys.executable, "-c", f"import skindb\n{block}"] = None
+                found["python", f"import skindb\n{block}"] = None
     return sorted(map(list, found), key=lambda call: call[1] in LAST)
 
 
 def failure(call: list[str]) -> str:
     """Messages of a call that fails; empty if it succeeds.
 
-    Commands run in this process, which imports skindb once; the README and the tests of
-    the command line start `skindb` as a user does.
+    All run in this process, which imports skindb once; the README and the tests of the
+    command line start `skindb` as a user does.
     """
     if call[0] == "skindb":
         result = CliRunner().invoke(cli, call[1:])
         messages = f"{result.output}{result.exception or ''}"
         return messages if result.exit_code else ""
-    done = subprocess.run(call, capture_output=True, text=True, check=False)
-    return done.stdout + done.stderr if done.returncode else ""
+    try:
+        with redirect_stdout(StringIO()):
+            exec(call[1], {})
+    except Exception:  # noqa: BLE001  whatever a block raises
+        return traceback.format_exc()
+    return ""
 
 
 def rehearsal() -> list[list[str]]:
@@ -103,14 +107,13 @@ def rehearsal() -> list[list[str]]:
         for _, words in commands(page)
     ]
     block = re.findall(r"^```python\n(.*?)^```", page, re.S | re.M)
-    return [*called, [sys.executable, "-c", *block]]
+    return [*called, ["python", *block]]
 
 
 def main() -> int:
     """Run the commands, and stop at the first one that fails."""
     os.environ["MPLBACKEND"] = "agg"
-    with tempfile.TemporaryDirectory() as folder, chdir(folder):
-        copytree(ROOT / "demo/db", "demo/db")
+    with demo_copy() as folder, chdir(folder):
         Path("faces").symlink_to("demo/db")
         write_laboratory(Path("LAB"), **SMALL)
         found = calls() + rehearsal()

@@ -8,24 +8,21 @@ that notebooks run only once.
 from __future__ import annotations
 
 import sys
-import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from shutil import copytree
 
 import nbformat
+from demo_copy import BUILD, ROOT, demo_copy
 from nbclient import NotebookClient
 
-ROOT = Path(__file__).resolve().parents[1]
-EXECUTED = ROOT / "docs" / "_build" / "notebooks"
+EXECUTED = BUILD / "notebooks"
 
 
 def run(path: Path) -> None:
     """Run a notebook and store its outputs; raises the exception of a cell."""
     notebook = nbformat.read(path, as_version=4)
-    with tempfile.TemporaryDirectory() as folder:
-        copytree(ROOT / "demo/db", Path(folder) / "demo/db")
-        work = Path(folder) / "notebooks"
+    with demo_copy() as folder:
+        work = folder / "notebooks"
         work.mkdir()
         place = {"metadata": {"path": str(work)}}
         NotebookClient(notebook, timeout=None, resources=place).execute()
