@@ -1,10 +1,10 @@
 """Runs commands in this process, which has its own file system, and prints the outcomes as JSON.
 
-    unshare --mount --map-root-user python hostile_disc.py PLACE MOUNT < steps.json
+    unshare --mount --map-root-user python hostile_disc.py
 
-MOUNT makes PLACE what it is to be. A step is ["run", arguments of skindb], ["leave",
-bytes that stay free], ["free"], or ["read"], which reads by the functions of a
-database.
+Each line of standard input is a place, a command that makes it what it is to be, and
+steps. A step is ["run", arguments of skindb], ["leave", bytes that stay free],
+["free"], or ["read"], which reads by the functions of a database.
 """
 
 from __future__ import annotations
@@ -45,12 +45,11 @@ def read(place: Path) -> dict[str, object]:
     }
 
 
-def main() -> None:
-    """Mount and make every step."""
-    place = Path(sys.argv[1])
-    subprocess.run(["sh", "-c", sys.argv[2]], check=True)
+def outcomes(place: Path, mount: str, steps: list[list[object]]) -> list[object]:
+    """Mount, make every step, and return the outcomes of "run" and "read"."""
+    subprocess.run(["sh", "-c", mount], check=True)
     told: list[object] = []
-    for what, *arguments in json.load(sys.stdin):
+    for what, *arguments in steps:
         if what == "leave":
             fill(place, *arguments)
         elif what == "free":
@@ -60,8 +59,10 @@ def main() -> None:
         else:
             done = _run(*arguments[0])
             told.append([done.returncode, done.stdout, done.stderr])
-    print(json.dumps(told))
+    return told
 
 
 if __name__ == "__main__":
-    main()
+    for line in sys.stdin:
+        folder, *rest = json.loads(line)
+        print(json.dumps(outcomes(Path(folder), *rest)), flush=True)

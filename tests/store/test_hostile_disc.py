@@ -39,13 +39,14 @@ YEAR = 365 * 86400.0
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def made(pristine, tmp_path_factory):
     """A folder with captures and a database: two takes, of which one is fitted."""
     out = tmp_path_factory.mktemp("hostile")
-    size = ("--cameras", "3", "--lights", "12", "--width", "48", "--height", "60")
-    _done("simulate", out / "c", "--takes", "2", *size)
-    for take in ("V001", "V001.lotion"):
-        _done("ingest", out / "db", out / "c" / take, "--spacing", "6")
+    for condition, take in (("normal", "V001"), ("lotion", "V001.lotion")):
+        about = Path(shutil.copytree(pristine, out / "c" / take), "capture.json")
+        changed = {"subject": "V001", "condition": condition}
+        about.write_text(json.dumps(json.loads(about.read_text()) | changed))
+        _done("ingest", out / "db", out / "c" / take, "--spacing", "8")
     _done("fit", out / "db", "V001")
     return out
 
@@ -65,7 +66,7 @@ def _writing(place, captures, name):
             db,
             str(captures / "V001.lotion"),
             "--spacing",
-            "6",
+            "8",
             "--again",
             "--no-progress",
         ),
@@ -89,24 +90,27 @@ def _reading(place):
     ]
 
 
-def _apart(place, mount, steps):
-    """Output of `hostile_disc.py` for the steps."""
-    program = [
-        sys.executable,
-        str(Path(__file__).with_name("hostile_disc.py")),
-        str(place),
-        mount,
-    ]
+@pytest.fixture(scope="module")
+def apart():
+    """Function that returns the output of `hostile_disc.py` for a place, how it is
+    mounted, and steps; one process for all of them.
+    """
+    program = [sys.executable, str(Path(__file__).with_name("hostile_disc.py"))]
     env = os.environ | {"PYTHONPATH": str(Path(skindb.__file__).parents[1])}
-    done = subprocess.run(
+    with subprocess.Popen(
         [*APART, *program],
-        input=json.dumps(steps),
-        capture_output=True,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
         text=True,
         env=env,
-    )
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
+    ) as process:
+
+        def run(place, mount, steps):
+            process.stdin.write(json.dumps([str(place), mount, steps]) + "\n")
+            process.stdin.flush()
+            return json.loads(process.stdout.readline())
+
+        yield run
 
 
 def _one_line(code, stderr, found, cure, place):
@@ -119,7 +123,9 @@ def _one_line(code, stderr, found, cure, place):
 
 
 @needs_mounts
-def test_full_disk__is_one_line_of_every_command_and_harms_nothing(made, tmp_path):
+def test_full_disk__is_one_line_of_every_command_and_harms_nothing(
+    made, apart, tmp_path
+):
     place = tmp_path / "full"
     tries = []
     place.mkdir()
@@ -134,7 +140,7 @@ def test_full_disk__is_one_line_of_every_command_and_harms_nothing(made, tmp_pat
                 tries.append((left, command[0]))
         steps += [["read"], ["free"]]
     again = [*_writing(place, made / "c", "free"), ("verify", str(place / "db"))]
-    told = _apart(
+    told = apart(
         place, mount, [*steps, *(["run", command] for command in again), ["read"]]
     )
     ended = iter(told)
@@ -156,7 +162,7 @@ def test_full_disk__is_one_line_of_every_command_and_harms_nothing(made, tmp_pat
 
 
 @needs_mounts
-def test_full_disk__a_withdrawal_needs_no_space(made, tmp_path):
+def test_full_disk__a_withdrawal_needs_no_space(made, apart, tmp_path):
     place = tmp_path / "full"
     place.mkdir()
     mount = f"mount -t tmpfs -o size=24m tmpfs {place} && cp -a {made / 'db'} {place}"
@@ -168,7 +174,7 @@ def test_full_disk__a_withdrawal_needs_no_space(made, tmp_path):
             for command in (("withdraw", db, "V001", "--yes"), ("verify", db))
         ),
     ]
-    (code, stdout, stderr), verified = _apart(place, mount, [*steps, ["free"]])
+    (code, stdout, stderr), verified = apart(place, mount, [*steps, ["free"]])
     assert (code, stderr) == (0, "")
     assert (
         stdout.splitlines()[-1]
@@ -178,14 +184,16 @@ def test_full_disk__a_withdrawal_needs_no_space(made, tmp_path):
 
 
 @needs_mounts
-def test_read_only_folder__reads_everything_and_refuses_to_write_in_one_line(made):
+def test_read_only_folder__reads_everything_and_refuses_to_write_in_one_line(
+    made, apart
+):
     steps = [["run", command] for command in _reading(made)] + [["read"]]
     shutil.rmtree(made / "db/catalogue", ignore_errors=True)
     read_only = f"mount --bind {made} {made} && mount -o remount,bind,ro {made}"
     writes = _writing(made, made / "c", "none")
-    told = _apart(made, read_only, [*steps, *(["run", command] for command in writes)])
+    told = apart(made, read_only, [*steps, *(["run", command] for command in writes)])
     assert not (made / "db/catalogue").exists()
-    for mine, its in zip(told, _apart(made, "true", steps), strict=False):
+    for mine, its in zip(told, apart(made, f"umount {made}", steps), strict=False):
         if isinstance(mine, dict):
             assert mine == its
         else:
@@ -317,7 +325,9 @@ def test_commit__that_the_disk_refuses_leaves_the_version_before_it(
 
 
 @needs_mounts
-def test_full_disk__a_backup_and_a_restore_end_in_one_line_and_continue(made, tmp_path):
+def test_full_disk__a_backup_and_a_restore_end_in_one_line_and_continue(
+    made, apart, tmp_path
+):
     place = tmp_path / "full"
     place.mkdir()
     mount = f"mount -t tmpfs -o size=24m tmpfs {place}"
@@ -341,7 +351,7 @@ def test_full_disk__a_backup_and_a_restore_end_in_one_line_and_continue(made, tm
         steps += [["run", command]]
         checked += [(command[0], left) for left in (0, 400_000, None)]
     told = iter(
-        _apart(
+        apart(
             place,
             mount,
             [*steps, ["run", ("verify", copy)], ["run", (*commands[0], "--verify")]],
