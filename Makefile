@@ -51,7 +51,7 @@ types: $(STAMP)
 docs: $(STAMP) $(if $(wildcard demo/db),$(EXECUTED))
 	$(BIN)/python docs/make_variables.py
 	rm -rf docs/api/generated
-	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet docs docs/_build/html
+	$(BIN)/python -m sphinx --builder html --jobs auto --fail-on-warning --keep-going --quiet docs docs/_build/html
 
 $(EXECUTED): $(wildcard notebooks/*.ipynb) | $(STAMP)
 	$(BIN)/python .ci/run_notebooks.py
