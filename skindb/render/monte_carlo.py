@@ -4,7 +4,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -40,6 +42,7 @@ RAYS_PER_AXIS = 2
 RAYS_PER_AXIS_ENVIRONMENT = 4
 # for an estimate of the variance that can be compared with the target error
 MIN_BATCHES = 4
+MAX_RAYS = 2_000_000  # that are shaded together, with 500 bytes each
 LIGHTS_PER_RAY = 4  # lights drawn for each ray; with fewer lights, all are used
 CELLS = 16  # of normals along each axis
 # in probabilities, because normals of a cell differ by up to 0.1, and for the discs of
@@ -117,11 +120,10 @@ def render_monte_carlo(
     rays = RayScene(surface.vertices, surface.faces) if scene is None else scene
     sums = RunningMean()
     painter = _Painter.of(surface, rays, lighting, quality, rng)
+    parts = partial(_parts, surface, camera, rays, pixels)
     if quality.subsurface and "diffuse" in quality.terms:
-        view = trace_view(
-            surface, camera, samples=RAYS_PER_AXIS, scene=rays, pixels=pixels
-        )
-        painter, sums.more = painter.with_subsurface_light(view, rng, progress)
+        centres = partial(parts, RAYS_PER_AXIS)
+        painter, sums.more = painter.with_subsurface_light(centres, rng, progress)
     axis = RAYS_PER_AXIS
     enough = quality.samples >= 2 * RAYS_PER_AXIS_ENVIRONMENT**2
     if lighting.environment is not None and enough:
@@ -134,10 +136,10 @@ def render_monte_carlo(
         or sums.count < MIN_BATCHES
         or sums.relative_error() > quality.error
     ):
-        view = trace_view(
-            surface, camera, samples=axis, scene=rays, rng=rng, pixels=pixels
-        )
-        sums.add(painter.batch(view, rng), view.coverage)
+        images = [
+            (painter.batch(view, rng), view.coverage) for view in parts(axis, rng)
+        ]
+        sums.add(*map(np.concatenate, zip(*images, strict=True)))
         progress("render", min(sums.count * per_batch, limit), limit)
     return Rendering(
         np.asarray(sums.mean, np.float32),
@@ -147,6 +149,28 @@ def render_monte_carlo(
         sums.relative_error(),
         perf_counter() - sums.started,
     )
+
+
+def _parts(
+    surface: Surface,
+    camera: Camera,
+    scene: RayScene,
+    pixels: Mask | None,
+    samples: int,
+    rng: np.random.Generator | None = None,
+) -> Iterator[View]:
+    """Views of as many rows of the picture as memory allows, from top to bottom."""
+    step = max(MAX_RAYS // (camera.width * samples**2), 1)
+    for low in range(0, camera.height, step):
+        high = min(low + step, camera.height)
+        yield trace_view(
+            surface,
+            camera.rows(low, high),
+            samples=samples,
+            scene=scene,
+            rng=rng,
+            pixels=None if pixels is None else pixels[low:high],
+        )
 
 
 @dataclass(frozen=True)
@@ -193,9 +217,12 @@ class _Painter:
         return cls(surface, scene, lighting, quality, lobes, weights, choice, bounced)
 
     def with_subsurface_light(
-        self, view: View, rng: np.random.Generator, progress: Progress
+        self,
+        views: Callable[[], Iterator[View]],
+        rng: np.random.Generator,
+        progress: Progress,
     ) -> tuple[_Painter, Image]:
-        """A painter with subsurface light where the view shows the surface, and the variance
+        """A painter with subsurface light where the views show the surface, and the variance
         (h, w, 3) that it adds to the picture.
         """
         error = self.quality.error
@@ -206,7 +233,9 @@ class _Painter:
             self.surface,
             self.lighting,
             self.scene,
-            view.shown(len(self.surface.vertices)),
+            np.any(
+                [view.shown(len(self.surface.vertices)) for view in views()], axis=0
+            ),
             tolerance=self.quality.tolerance,
             count=count,
             error=np.inf if error is None else error / 2,
@@ -216,8 +245,11 @@ class _Painter:
         if self.exitance is not None:
             light = light + self.exitance
         # errors of neighbours go together, so that the mean over a pixel does not reduce them
-        spread = escape_factor(view, self.surface.eta) * view.interpolate(spread)
-        return replace(self, exitance=light), np.square(view.image(spread))
+        images = [
+            view.image(escape_factor(view, self.surface.eta) * view.interpolate(spread))
+            for view in views()
+        ]
+        return replace(self, exitance=light), np.square(np.concatenate(images))
 
     def batch(self, view: View, rng: np.random.Generator) -> Image:
         """One independent estimate of the picture (h, w, 3)."""

@@ -135,6 +135,11 @@ class Camera(Pinhole):
         K = np.diag([factor, factor, 1.0]) @ self.K
         return replace(self, K=K, width=width, height=height)
 
+    def rows(self, low: int, high: int) -> Camera:
+        """The part of the picture from row `low` to `high`."""
+        K = self.K - np.array([[0.0, 0, 0], [0, 0, low], [0, 0, 0]])
+        return replace(self, K=K, height=high - low)
+
 
 @dataclass(frozen=True)
 class Lights:

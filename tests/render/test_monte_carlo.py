@@ -18,6 +18,7 @@ from skindb.optics.dipole_tree import subsurface_exitance
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.tables import TableGrid, directional_albedo, tabulate
+from skindb.render import monte_carlo
 from skindb.render.image import write_exr
 from skindb.render.monte_carlo import (
     LIGHTS_PER_RAY,
@@ -269,6 +270,36 @@ def test_render__the_same_seed_gives_the_same_picture() -> None:
     assert not np.array_equal(
         one.radiance, rendered(ball(), SKY, seed=2, samples=32).radiance
     )
+
+
+@pytest.mark.parametrize("subsurface", [False, True])
+def test_render__in_parts_that_fit_into_memory(monkeypatch, subsurface) -> None:
+    n = len(ball().vertices)
+    translucent = {"s": np.full((n, 3), 0.5), "sigma_tr": np.full((n, 3), 1.0)}
+    surface = replace(ball(), **translucent)
+    options = {"samples": 64, "subsurface": subsurface}
+    whole = rendered(surface, SKY, seed=3, **options)
+    sizes = []
+
+    def counted(surface, camera, **others):
+        view = trace_view(surface, camera, **others)
+        sizes.append(camera.height * camera.width * view.samples**2)
+        return view
+
+    monkeypatch.setattr(monte_carlo, "trace_view", counted)
+    monkeypatch.setattr(monte_carlo, "MAX_RAYS", 5 * 24 * 16)
+    parts = rendered(surface, SKY, **options)
+    assert max(sizes) <= 5 * 24 * 16
+    assert parts.radiance.shape == whole.radiance.shape
+    # rays at random points of the pixels at the edge
+    np.testing.assert_allclose(parts.coverage, whole.coverage, atol=0.3)
+    np.testing.assert_array_equal(parts.coverage == 0, whole.coverage == 0)
+    seen = (whole.coverage == 1)[..., None] & (whole.variance > 0)
+    spread = np.sqrt(parts.variance + whole.variance)[seen]
+    z = (parts.radiance - whole.radiance)[seen] / spread
+    # 1 with many batches; these have four each, so that variances are rough
+    assert np.sqrt(np.mean(z**2)) < 1.7
+    assert np.median(np.abs(z)) < 1
 
 
 def test_environment__draws_by_its_density() -> None:
