@@ -90,15 +90,21 @@ class Bench:
             return sorted(path for path in out.iterdir() if path.is_dir())
         return simulate_takes(out, SimulationParameters(**parameters), takes=takes)
 
-    def database(self) -> Path:
-        """A database of fitted takes."""
-        path = self.folder / "db"
+    def ingested(self) -> Path:
+        """A database of takes that are not fitted."""
+        path = self.folder / "captures-only"
         if not path.exists():
             size = {"cameras": 4, "lights": 16, "width": 120, "height": 150}
             db = skindb.open(path, create=True)
             for capture in self.captures("takes", TAKES, **size):
                 ingest_take(db, capture, spacing_mm=4.0)
-            shutil.copytree(path, self.folder / "captures-only")
+        return path
+
+    def database(self) -> Path:
+        """A database of fitted takes."""
+        path = self.folder / "db"
+        if not path.exists():
+            shutil.copytree(self.ingested(), path)
             program("fit", str(path))
         return path
 
@@ -260,11 +266,10 @@ def starting(bench: Bench) -> list[Row]:
 
 def workers(bench: Bench) -> list[Row]:
     """Fits of small takes by one and by two processes, each with one thread."""
-    bench.database()
     walls = []
     for count in ("1", "2"):
         db = bench.folder / f"workers-{count}"
-        shutil.copytree(bench.folder / "captures-only", db)
+        shutil.copytree(bench.ingested(), db)
         arguments = ("fit", str(db), "--workers", count, "--no-progress")
         walls.append(program(*arguments, **ONE_THREAD)[0])
     work = f"{TAKES} small takes, two workers"
