@@ -27,14 +27,13 @@ sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parent)]
 
 import apart
 import dask
-import distributed  # noqa: F401  as the two below: else every process would import it
 import numpy as np
 import xarray as xr
 from mutations_store import damage, kind_of
 from planted_cohort import few_materials
 
 import skindb
-import skindb.analysis
+import skindb.analysis  # as the next: else every process would import it
 import skindb.ingest
 from skindb import workflow
 from skindb.cli import main

@@ -156,17 +156,20 @@ def prepare(folder: Path, sources: Mapping[str, str]) -> None:
     """The databases that are copied for each case: with a capture, with a model too,
     and with nothing but a folder.
     """
-    for name in ("fit", "refit"):
+    for name in sources:
+        if name == "ingest":
+            (folder / "ingest").mkdir()
+            write_capture(folder / "ingest/folder")
+            continue
         db = skindb.open(sources[name], create=True)
-        tree = capture(FIT_TAKE, PEOPLE[FIT_TAKE], 0)
+        tree = capture(FIT_TAKE, PEOPLE["S02"], 0)  # with one site
         with db.stage("capture", FIT_TAKE) as stage:
             stage.write(groups_of(tree))
             stage.commit(tree.attrs)
-    workflow.fit_take(
-        db, FIT_TAKE, replace(PARAMETERS, k=1), dictionary=few_materials()
-    )
-    (folder / "ingest").mkdir()
-    write_capture(folder / "ingest/folder")
+        if name == "refit":
+            workflow.fit_take(
+                db, FIT_TAKE, replace(PARAMETERS, k=1), dictionary=few_materials()
+            )
 
 
 def copied(source: Path, source_url: str, work: Path, new_url: NewUrl) -> str:
@@ -411,10 +414,8 @@ def table(done: list[apart.Case]) -> list[str]:
 def ready(
     folder: Path, new_url: NewUrl, variants: Iterable[str] = STAGES
 ) -> dict[str, str]:
-    """Prepare every variant, measure the given ones, and return the URLs of the
-    databases to copy.
-    """
-    sources = {variant: new_url(folder / variant) for variant in STAGES}
+    """Prepare and measure variants, and return the URLs of the databases to copy."""
+    sources = {variant: new_url(folder / variant) for variant in variants}
     apart.in_a_process(partial(prepare, folder, sources))
     for variant in variants:
         work = folder / "measured" / variant

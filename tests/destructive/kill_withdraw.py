@@ -20,6 +20,7 @@ The program ends with 1 if that fails once, or if a process ends with a tracebac
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import os
 import random
@@ -34,10 +35,12 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
+from unittest import mock
 
 HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
+sys.path[:0] = [str(HERE.parent), str(HERE)]
 
+import apart  # noqa: F401  its settings
 import dask.array  # noqa: F401  see IMPORTED
 from bucket_server import new_bucket, own_cache, s3_server, settings
 from planted_population import TABLES, population
@@ -69,6 +72,10 @@ WRITERS: dict[str, Callable[[Database], object]] = {
     "ingest": lambda db: workflow.ingest_take(
         db, os.environ["CAPTURE"], spacing_mm=8.0, photographs=0
     ),
+}
+UNDISTURBED = WRITERS | {
+    "erase": lambda db: db.erase(SUBJECT),
+    "withdraw": lambda db: workflow.withdraw(db, SUBJECT),
 }
 COMPLETED_BY: dict[str, Callable[[Database], object]] = {
     "withdraw": lambda db: _withdraw_again(db),
@@ -184,30 +191,37 @@ class Trial:
     url, folder
         Copy of the database, and a folder for the rest of the case.
     seconds
-        How long each writer, and "erase" and "withdraw", take undisturbed.
+        How long a writer, and the part of a withdrawal in which it is killed, take
+        undisturbed.
     draw
         Source of random choices.
     """
 
     def __init__(
-        self, url: str, folder: Path, seconds: dict[str, float], draw: random.Random
+        self,
+        url: str,
+        folder: Path,
+        seconds: Callable[[str], float],
+        draw: random.Random,
     ) -> None:
         self.url = url
         self.folder = folder
-        self.seconds = seconds
+        self.writers = draw.sample(sorted(WRITERS), draw.randint(0, 3))
+        self.part = draw.choice(["erase", "erase", "withdraw"])
+        # measured before the case begins
+        self.seconds = {name: seconds(name) for name in (*self.writers, self.part)}
         self.draw = draw
         self.processes: dict[str, Process] = {}
 
     def run(self) -> str:
         """What happened, in a few words."""
-        writers = self.draw.sample(sorted(WRITERS), self.draw.randint(0, 3))
-        for name in writers:
+        for name in self.writers:
             self._begin(name, WRITERS[name])
             time.sleep(self.draw.uniform(0, 1.1 * self.seconds[name]))
             self.processes[name].signal(signal.SIGSTOP)
-        before = [name for name in writers if self.draw.random() < 0.3]
+        before = [name for name in self.writers if self.draw.random() < 0.3]
         outcome = self._withdraw(before)
-        self._end(writers)
+        self._end(self.writers)
         if outcome in NOT_BEGUN:  # perhaps it was killed before it changed anything
             self._complete("withdraw")
         self._complete("clean")
@@ -215,8 +229,7 @@ class Trial:
 
     def _withdraw(self, before: list[str]) -> str:
         self._begin("withdraw", lambda db: workflow.withdraw(db, SUBJECT, wait=30))
-        most = self.seconds[self.draw.choice(["erase", "erase", "withdraw"])]
-        time.sleep(self.draw.uniform(0, 1.2 * most))
+        time.sleep(self.draw.uniform(0, 1.2 * self.seconds[self.part]))
         what = self.draw.choice(["killed", "killed", "suspended", "left alone"])
         process = self.processes["withdraw"]
         if what != "left alone":
@@ -341,20 +354,22 @@ def _without_reference(root: Path) -> dict[str, bytes]:
 
 @contextmanager
 def _environment(folder: Path, capture: Path) -> Iterator[list[Path]]:
-    """An own cache, data folder and folder for temporary files; yields all."""
+    """An own cache, data folder and folder for temporary files, until the end; yields all."""
     temporary = folder / "tmp"
     cache = folder / "cache"
     share = folder / "share"
-    temporary.mkdir()
+    temporary.mkdir(parents=True)
     own_cache(cache)
-    os.environ |= {
+    variables = {
         "SKINDB_CACHE": str(cache),
         "TMPDIR": str(temporary),
         "CAPTURE": str(capture),
+        "XDG_DATA_HOME": str(share),
     }
-    os.environ["XDG_DATA_HOME"] = str(share)
     tempfile.tempdir = None
-    yield [temporary, cache, share]
+    with mock.patch.dict(os.environ, variables):
+        yield [temporary, cache, share]
+    tempfile.tempdir = None
 
 
 def main() -> None:
@@ -404,25 +419,17 @@ def main() -> None:
             )
             return url
 
-        seconds = {}
-        # the first ingest compiles kernels
-        for name, work in [("ingest", WRITERS["ingest"]), *WRITERS.items()]:
-            url = new_case(f"{name} {len(seconds)}")
-            seconds[name] = _seconds(
-                lambda work=work, url=url: work(skindb.open(url)), folder / "time.log"
-            )
-        url = new_case("erase")
-        seconds["erase"] = _seconds(
-            lambda: skindb.open(url).erase(SUBJECT), folder / "time.log"
-        )
-        url = new_case("withdraw")
-        seconds["withdraw"] = _seconds(
-            lambda: workflow.withdraw(skindb.open(url), SUBJECT), folder / "time.log"
-        )
-        print({name: round(value, 2) for name, value in seconds.items()}, flush=True)
+        @functools.cache
+        def seconds(name: str) -> float:
+            with _environment(folder / name, capture):
+                for attempt in range(1 + (name == "ingest")):  # the first one compiles
+                    url = new_case(f"{name} {attempt}")
+                    work = partial(lambda url: UNDISTURBED[name](skindb.open(url)), url)
+                    taken = _seconds(work, folder / "time.log")
+            return taken
+
         for number in range(args.cases):
             own = folder / f"own {number}"
-            own.mkdir()
             with _environment(own, capture) as folders:
                 url = new_case(number)
                 trial = Trial(url, own, seconds, draw)

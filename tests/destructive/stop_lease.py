@@ -131,7 +131,7 @@ def main() -> None:
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        kill_fit.ready(folder, kill_fit.in_folder, [])  # its fit compiles
+        kill_fit.ready(folder, kill_fit.in_folder, ["fit"])  # which compiles
         done = apart.run(
             range(asked.cases), prepare, folder, apart.Limits(asked.jobs, seconds=300)
         )

@@ -12,11 +12,11 @@ import pytest
 
 RUNS = (
     "kill_fit --cases 1 --seed 3",
-    "kill_withdraw --cases 1",
-    "kill_backup --every 90",
+    "kill_withdraw --cases 1 --seed 502",
+    "kill_backup --every 200",
     "stop_lease --cases 1",
-    "race_lease --commits 16 --kills 3",
-    "power_loss --every 300",
+    "race_lease --commits 8 --kills 2",
+    "power_loss --every 500",
 )
 
 
