@@ -10,7 +10,7 @@ from pathlib import Path
 from shutil import copytree, ignore_patterns
 
 ROOT = Path(__file__).resolve().parents[1]
-BUILD = ROOT / "docs/_build"
+DEMO = ROOT / "demo"
 
 
 @contextmanager
@@ -20,10 +20,8 @@ def demo_copy() -> Iterator[Path]:
     Stored versions are linked, because nothing changes their files: 400 MB for every
     notebook would keep the disk busy. Links need the file system of the demo.
     """
-    BUILD.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=BUILD) as folder:
-        source = ROOT / "demo/db"
+    with tempfile.TemporaryDirectory(dir=DEMO) as folder:
         target = Path(folder, "demo/db")
-        copytree(source, target, ignore=ignore_patterns("data"))
-        copytree(source / "data", target / "data", copy_function=os.link)
+        copytree(DEMO / "db", target, ignore=ignore_patterns("data"))
+        copytree(DEMO / "db/data", target / "data", copy_function=os.link)
         yield Path(folder)

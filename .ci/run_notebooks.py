@@ -12,10 +12,10 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import nbformat
-from demo_copy import BUILD, ROOT, demo_copy
+from demo_copy import ROOT, demo_copy
 from nbclient import NotebookClient
 
-EXECUTED = BUILD / "notebooks"
+EXECUTED = ROOT / "docs" / "_build" / "notebooks"
 
 
 def run(path: Path) -> None:
