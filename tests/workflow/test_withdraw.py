@@ -20,6 +20,7 @@ import zarr
 from click.testing import CliRunner
 from planted_population import TABLES, population
 from planted_sheet import face_take
+from traces import contents
 
 from skindb import workflow
 from skindb.analysis import translucency
@@ -80,7 +81,7 @@ def _commit(db, kind, take, tree, **about):
         return stage.commit(tree.attrs | about)
 
 
-def _planted(url: Path | str) -> Database:
+def _planted(url: Path) -> Database:
     """Takes A, A.lotion, B, C in two generations each; studies, an edit and a release
     that used all of them.
     """
@@ -188,8 +189,10 @@ def _copy(url: str, folder: Path) -> Path:
     return folder
 
 
-def test_withdraw__leaves_nothing_of_a_subject_in_a_bucket(bucket, tmp_path):
-    db = _planted(bucket)
+def test_withdraw__leaves_nothing_of_a_subject_in_a_bucket(made, bucket, tmp_path):
+    db = Database(bucket)
+    for key, content in contents(made).items():
+        db.place.replace(key, content)
     assert len(_found(_copy(bucket, tmp_path / "before"), "A")) > 10
     done = workflow.withdraw(db, "A")
     assert _found(_copy(bucket, tmp_path / "after"), "A") == []
