@@ -245,7 +245,7 @@ def _difference(place: Place, key: str, file: Committed) -> str:
 def _record_faults(place: Place, record: Record, tables: bytes) -> list[Fault]:
     """Faults of a record that does not agree with the attributes of its version."""
     store = VerifiedStore(place, record)
-    tree = open_datatree(store, engine="zarr", consolidated=False, chunks=None)  # type: ignore[arg-type]
+    tree = open_datatree(store, engine="zarr", consolidated=True, chunks=None)  # type: ignore[arg-type]
     root = json_object(place.read_small(f"{record.path}/zarr.json"))
     wrong = [] if root.get("attributes") == record.provenance else ["provenance"]
     if record.kind not in KINDS_OF_ONE_SUBJECT:
