@@ -46,7 +46,7 @@ from skindb.render.views import (
     turntable_azimuths,
 )
 from skindb.schema.consent import honour_consent
-from skindb.types import Bytes, Float32, Progress, dots, lengths, silent
+from skindb.types import Array, Bytes, Float32, Progress, dots, lengths, silent, unit
 
 UNITS = "radiance"  # in the unit of the photographs, or of the environment
 NO_LIGHTS = Lights(
@@ -299,8 +299,9 @@ def render_picture(
         light beside the dome; size, the width in pixels; alpha, whether the background is
         transparent; and exposure, a factor on the radiance. The exposure "fixed" shows a
         white matte surface, which stands in the place of the face and faces the camera (the
-        front for a view), as display white, so that pictures under the same light are
-        comparable. "auto" shows the brightest skin as display white.
+        front for a view), as display white, or if the light comes from elsewhere, one with
+        half of the light that any surface receives, so that pictures under the same light
+        are comparable. "auto" shows the brightest skin as display white.
 
     Returns
     -------
@@ -415,34 +416,28 @@ def fixed_exposure(lighting: Lighting, camera: Camera) -> float:
     shown as display white.
 
     It depends on the light and the camera only. The irradiance of this surface is taken
-    to be at least a fifth of its mean over all orientations, which counts if the light
-    comes from behind.
+    to be at least half of that of the surface which receives the most, which counts if
+    the light comes from the side or from behind.
     """
-    normal = camera.centre / np.linalg.norm(camera.centre)
-    facing = 0.0
-    mean = 0.0
+    towards: list[Array] = [np.zeros((0, 3))]
+    power: list[Array] = [np.zeros(0)]
     if lighting.lights is not None:
         lights = lighting.lights
-        square = np.square(lights.position).sum(axis=1)
-        along = (
-            np.maximum(
-                dots(-lights.position, lights.axis) / np.sqrt(square),
-                0,
-            )
-            ** lights.falloff
-        )
-        power = lights.intensity.mean(axis=1) * along / square
-        facing += float(
-            (power * np.maximum(lights.position @ normal, 0) / np.sqrt(square)).sum()
-        )
-        mean += float(power.sum()) / 4
+        distance = lengths(lights.position)
+        towards.append(lights.position / distance[:, None])
+        along = np.maximum(-dots(towards[-1], lights.axis), 0) ** lights.falloff
+        power.append(lights.intensity.mean(axis=1) * along / distance**2)
     if lighting.environment is not None:
         direction, energy = lighting.environment.texels()
-        level = energy.mean(axis=1)
-        facing += float((level * np.maximum(direction @ normal, 0)).sum())
-        mean += float(level.sum()) / 4
-    irradiance = max(facing, 0.2 * mean)
-    return float(np.pi / irradiance) if irradiance > 0 else 1.0
+        towards.append(direction)
+        power.append(energy.mean(axis=1))
+    # one of them is within 28 degrees of the surface that receives the most
+    sides = np.stack(np.meshgrid(*3 * [[-1.0, 0, 1]]), axis=-1).reshape(-1, 3)
+    normals = unit(np.concatenate([camera.centre[None], sides[sides.any(axis=1)]]))
+    cosine = np.maximum(normals @ np.concatenate(towards).T, 0)
+    irradiance = cosine @ np.concatenate(power)
+    level = max(irradiance[0], irradiance.max() / 2)
+    return float(np.pi / level) if level > 0 else 1.0
 
 
 def _write_exr(path: Path, seen: xr.Dataset) -> None:

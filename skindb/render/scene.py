@@ -199,7 +199,8 @@ def lights_from_dome(dome: xr.Dataset) -> Lights:
 
 def from_model(model: xr.DataTree) -> Surface:
     """Surface of a fitted model, with the tables of its reduced basis. Surfels without a fit
-    take the values of the nearest fitted one, so that pictures have no holes.
+    take the reflectance of the nearest fitted one, so that pictures have no holes, and
+    those without a normal that of the mesh.
 
     Parameters
     ----------
@@ -224,6 +225,7 @@ def from_model(model: xr.DataTree) -> Surface:
     if variables.SIGMA_TR in fitted:
         values[variables.SIGMA_TR] = np.asarray(fitted[variables.SIGMA_TR].values)
     position = values.pop(variables.SURFEL_POSITION)
+    faces = model["mesh"].dataset[variables.TRIANGLE].values
     usable = usable_surfels(values)
     require(
         usable.any(),
@@ -235,7 +237,11 @@ def from_model(model: xr.DataTree) -> Surface:
     del values[variables.FIT_STATUS]
     _, near = cKDTree(position[usable]).query(position)
     nearest = np.flatnonzero(usable)[near]
+    fitted_normal = values[variables.SHADING_NORMAL]
     values = {name: value[nearest] for name, value in values.items()}
+    normals = values[variables.SHADING_NORMAL]
+    for better in (vertex_normals(position, faces), fitted_normal):
+        normals = np.where(finite_rows(better)[:, None], better, normals)
     sigma_tr = values.get(variables.SIGMA_TR)
     detail = None
     if "detail" in model.children:
@@ -244,8 +250,8 @@ def from_model(model: xr.DataTree) -> Surface:
         detail = np.concatenate([maps[name].values for name in names], axis=2)
     return Surface(
         vertices=position.astype(np.float64),
-        faces=model["mesh"].dataset[variables.TRIANGLE].values,
-        normals=values[variables.SHADING_NORMAL],
+        faces=faces,
+        normals=normals,
         diffuse=values[variables.DIFFUSE_REFLECTANCE],
         parameters=values["parameters"],
         model=reflectance,

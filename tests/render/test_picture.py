@@ -20,7 +20,9 @@ from skindb.render.rendering import (
     render_picture,
 )
 from skindb.render.scene import (
+    Camera,
     Lighting,
+    Lights,
     cameras_from_dome,
     from_model,
     lights_from_dome,
@@ -321,7 +323,7 @@ def test_render_picture__exposure_counts_lights_that_are_skipped(
 ) -> None:
     """It depends on camera and lights only, so that pictures of several faces are comparable."""
     dome = model["dome"].to_dataset()
-    # one light from the side, and two from behind, which only the mean over all directions contains
+    # one light from the side, and two from behind, which surfaces that face them receive
     place = np.array([[300.0, 0.0, 20.0], [0.0, 50.0, -300.0], [40.0, 0.0, -300.0]])
     dome["light_position"][:], dome["light_axis"][:] = (
         place,
@@ -335,6 +337,21 @@ def test_render_picture__exposure_counts_lights_that_are_skipped(
     assert told["exposure"] != fixed_exposure(
         Lighting(lighting.lights.select([0])), cameras_from_dome(dome)[0]
     )
+
+
+@pytest.mark.parametrize("azimuth", [100, 180])
+def test_fixed_exposure__light_from_the_side_does_not_blow_out(azimuth: int) -> None:
+    """The surface that faces the light has at most twice the radiance of display white."""
+    turn = np.radians(azimuth)
+    towards = np.array([[np.sin(turn), 0.0, np.cos(turn)]])
+    lights = Lights(
+        1000 * towards, np.full((1, 3), 4e6), np.zeros(1), -towards, np.zeros(1)
+    )
+    turned = np.diag([1.0, -1, -1])
+    front = Camera(np.eye(3), turned, np.array([0.0, 0, 1000]), np.zeros(5), 8, 8)
+    gain = fixed_exposure(Lighting(lights), front)
+    # an irradiance of 4 is a radiance of 4 / pi; 12 % as surfaces are compared 45 degrees apart
+    assert 2 <= gain * 4 / np.pi <= 2 / 0.88
 
 
 def test_render_picture__an_exr_says_what_it_holds(

@@ -69,6 +69,20 @@ def test_from_model__surfels_without_a_fit_are_filled_from_the_nearest() -> None
     np.testing.assert_array_equal(filled.vertices[4], [0, 20, 0])
 
 
+def test_from_model__surfels_without_a_normal_have_that_of_the_mesh() -> None:
+    """That of the nearest surfel would let light from behind shine into folds."""
+    unseen = int(FitStatus.UNSEEN)
+    tree = model([0, 0, 0, int(FitStatus.UNDETERMINED), unseen])
+    fitted = tree["fitted"].to_dataset()
+    fitted["surfel_position"][4] = [0, 10, 10]  # of a triangle that looks along -y
+    fitted["shading_normal"][4] = np.nan
+    fitted["shading_normal"][3] = [0.6, 0, 0.8]
+    tree["fitted"] = fitted
+    normals = from_model(tree).normals
+    np.testing.assert_allclose(normals[3], [0.6, 0, 0.8], rtol=1e-6)
+    np.testing.assert_allclose(np.abs(normals[4]), [0, 1, 0], atol=1e-6)
+
+
 def test_from_model__nothing_fitted_is_said() -> None:
     with pytest.raises(
         InputError, match="at least one surfel must be fitted for a picture; found none"
