@@ -32,6 +32,7 @@ from skindb.types import (
     Faces,
     Index,
     Mask,
+    dots,
     finite_rows,
     float64,
     lengths,
@@ -45,6 +46,7 @@ NEEDED = (
     variables.DIPOLE_S,
     variables.FIT_STATUS,
 )
+FOLD_MM = 10.0  # within which a wall of a fold has a fitted surfel that faces it
 MAX_LEVELS = 6  # of subdivision of a triangle into four
 MAX_VERTICES = 2_000_000  # of the finer mesh: about 1 GB with the octree
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear Rec. 709
@@ -200,7 +202,8 @@ def lights_from_dome(dome: xr.Dataset) -> Lights:
 def from_model(model: xr.DataTree) -> Surface:
     """Surface of a fitted model, with the tables of its reduced basis. Surfels without a fit
     take the reflectance of the nearest fitted one, so that pictures have no holes, and
-    those without a normal that of the mesh.
+    those without a normal that of the mesh. They are black in folds, whose walls look into
+    the head: away from a fitted surfel nearby.
 
     Parameters
     ----------
@@ -235,13 +238,18 @@ def from_model(model: xr.DataTree) -> Surface:
         "see the report of the fit",
     )
     del values[variables.FIT_STATUS]
-    _, near = cKDTree(position[usable]).query(position)
+    apart, near = cKDTree(position[usable]).query(position)
     nearest = np.flatnonzero(usable)[near]
     fitted_normal = values[variables.SHADING_NORMAL]
     values = {name: value[nearest] for name, value in values.items()}
     normals = values[variables.SHADING_NORMAL]
     for better in (vertex_normals(position, faces), fitted_normal):
         normals = np.where(finite_rows(better)[:, None], better, normals)
+    # scans of faces are open at the back, where light would come in
+    inwards = dots(normals, values[variables.SHADING_NORMAL]) < 0
+    in_fold = (inwards & (apart < FOLD_MM))[:, None]
+    for name in (variables.DIFFUSE_REFLECTANCE, "parameters"):
+        values[name] = np.where(in_fold, 0.0, values[name])
     sigma_tr = values.get(variables.SIGMA_TR)
     detail = None
     if "detail" in model.children:

@@ -70,7 +70,7 @@ def test_from_model__surfels_without_a_fit_are_filled_from_the_nearest() -> None
 
 
 def test_from_model__surfels_without_a_normal_have_that_of_the_mesh() -> None:
-    """That of the nearest surfel would let light from behind shine into folds."""
+    """Where it looks into the head, light that comes through the back is not shown."""
     unseen = int(FitStatus.UNSEEN)
     tree = model([0, 0, 0, int(FitStatus.UNDETERMINED), unseen])
     fitted = tree["fitted"].to_dataset()
@@ -81,6 +81,18 @@ def test_from_model__surfels_without_a_normal_have_that_of_the_mesh() -> None:
     normals = from_model(tree).normals
     np.testing.assert_allclose(normals[3], [0.6, 0, 0.8], rtol=1e-6)
     np.testing.assert_allclose(np.abs(normals[4]), [0, 1, 0], atol=1e-6)
+    assert (from_model(tree).diffuse > 0).all()
+    for height, is_black in ((4.0, True), (11.0, False)):  # of a wall that looks down
+        fitted["surfel_position"][4] = [5, 5, height]
+        tree["fitted"] = fitted
+        tree["mesh"] = dataset(
+            {"triangle": np.array([[0, 1, 2], [0, 2, 3], [4, 1, 0]])}
+        )
+        wall = from_model(tree)
+        assert wall.normals[4, 2] < 0
+        assert (wall.diffuse[4] == 0).all() == is_black
+        assert (wall.parameters[4] == 0).all() == is_black
+        assert (wall.diffuse[:4] > 0).all()
 
 
 def test_from_model__nothing_fitted_is_said() -> None:
