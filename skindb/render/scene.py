@@ -238,18 +238,7 @@ def from_model(model: xr.DataTree) -> Surface:
         "see the report of the fit",
     )
     del values[variables.FIT_STATUS]
-    apart, near = cKDTree(position[usable]).query(position)
-    nearest = np.flatnonzero(usable)[near]
-    fitted_normal = values[variables.SHADING_NORMAL]
-    values = {name: value[nearest] for name, value in values.items()}
-    normals = values[variables.SHADING_NORMAL]
-    for better in (vertex_normals(position, faces), fitted_normal):
-        normals = np.where(finite_rows(better)[:, None], better, normals)
-    # scans of faces are open at the back, where light would come in
-    inwards = dots(normals, values[variables.SHADING_NORMAL]) < 0
-    in_fold = (inwards & (apart < FOLD_MM))[:, None]
-    for name in (variables.DIFFUSE_REFLECTANCE, "parameters"):
-        values[name] = np.where(in_fold, 0.0, values[name])
+    values = _filled(values, usable, position, faces)
     sigma_tr = values.get(variables.SIGMA_TR)
     detail = None
     if "detail" in model.children:
@@ -259,7 +248,7 @@ def from_model(model: xr.DataTree) -> Surface:
     return Surface(
         vertices=position.astype(np.float64),
         faces=faces,
-        normals=normals,
+        normals=values[variables.SHADING_NORMAL],
         diffuse=values[variables.DIFFUSE_REFLECTANCE],
         parameters=values["parameters"],
         model=reflectance,
@@ -272,6 +261,24 @@ def from_model(model: xr.DataTree) -> Surface:
         uv=None if detail is None else fitted[variables.SURFEL_UV].values,
         detail=detail,
     )
+
+
+def _filled(
+    values: dict[str, AnyArray], usable: Mask, position: Array, faces: Faces
+) -> dict[str, AnyArray]:
+    """Values with those of surfels that are not usable, see `from_model`."""
+    apart, near = cKDTree(position[usable]).query(position)
+    nearest = np.flatnonzero(usable)[near]
+    filled = {name: value[nearest] for name, value in values.items()}
+    fitted = filled[variables.SHADING_NORMAL]
+    normals = fitted
+    for better in (vertex_normals(position, faces), values[variables.SHADING_NORMAL]):
+        normals = np.where(finite_rows(better)[:, None], better, normals)
+    # scans of faces are open at the back, where light would come in
+    in_fold = ((dots(normals, fitted) < 0) & (apart < FOLD_MM))[:, None]
+    for name in (variables.DIFFUSE_REFLECTANCE, "parameters"):
+        filled[name] = np.where(in_fold, 0.0, filled[name])
+    return filled | {variables.SHADING_NORMAL: normals}
 
 
 def usable_surfels(values: dict[str, AnyArray]) -> Mask:
