@@ -216,6 +216,9 @@ def surfel_albedo(
     """Albedo (n,) relative to the median: a low quantile of measured / predicted over
     the views that light a surfel.
     """
+    # takes longer to import than most commands run
+    from scipy.stats import quantile
+
     ratios = np.full((len(views), len(views[0].clear)), np.nan)
     for ratio, view in zip(ratios, views, strict=True):
         light = irradiance[view.light]
@@ -227,9 +230,7 @@ def surfel_albedo(
             ratio /= max(float(np.nanmedian(ratio)), FLOOR)
     measured = np.isfinite(ratios).any(axis=0)
     albedo = np.ones(ratios.shape[1])
-    # `np.nanquantile` makes a call for each column; most commands do without this import
-    from scipy.stats import quantile
-
+    # `np.nanquantile` makes a call for each column
     albedo[measured] = quantile(
         ratios[:, measured], ALBEDO_QUANTILE, axis=0, nan_policy="omit"
     )

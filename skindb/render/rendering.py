@@ -434,9 +434,11 @@ def fixed_exposure(lighting: Lighting, camera: Camera) -> float:
     # one of them is within 28 degrees of the surface that receives the most
     sides = np.stack(np.meshgrid(*3 * [[-1.0, 0, 1]]), axis=-1).reshape(-1, 3)
     normals = unit(np.concatenate([camera.centre[None], sides[sides.any(axis=1)]]))
-    cosine = np.maximum(normals @ np.concatenate(towards).T, 0)
-    irradiance = cosine @ np.concatenate(power)
-    level = max(irradiance[0], irradiance.max() / 2)
+    directions = np.concatenate(towards)
+    energies = np.concatenate(power)
+    # one by one, as an environment may have millions of texels
+    irradiance = [energies @ np.maximum(directions @ normal, 0) for normal in normals]
+    level = max(irradiance[0], max(irradiance) / 2)
     return float(np.pi / level) if level > 0 else 1.0
 
 

@@ -46,7 +46,7 @@ NEEDED = (
     variables.DIPOLE_S,
     variables.FIT_STATUS,
 )
-FOLD_MM = 10.0  # within which a wall of a fold has a fitted surfel that faces it
+FOLD_MM = 10.0  # largest distance of a wall of a fold from fitted surfels
 MAX_LEVELS = 6  # of subdivision of a triangle into four
 MAX_VERTICES = 2_000_000  # of the finer mesh: about 1 GB with the octree
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear Rec. 709
@@ -317,9 +317,8 @@ def subdivide_surface(surface: Surface, spacing: float, values: Array) -> Surfac
     values
         (v, c) values of the vertices; triangles with NaN are not divided.
     """
-    from trimesh.remesh import (
-        subdivide,
-    )  # takes longer to import than most commands run
+    # takes longer to import than most commands run
+    from trimesh.remesh import subdivide
 
     names = [
         name
