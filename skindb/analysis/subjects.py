@@ -11,6 +11,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -166,12 +168,16 @@ class Subjects:
         )
 
     def by_subject(self, name: str, subjects: Sequence[str]) -> Attribute:
-        """An attribute of the named subjects, each from its first take that has it."""
-        value_of: dict[str, Value] = {}
-        values = self.attribute(name).values
-        for subject, value in zip(self.subject, values, strict=True):
+        """An attribute of the named subjects, each from its first take that has it, or the
+        mean of numbers.
+        """
+        values: dict[str, list[Any]] = {}
+        attribute = self.attribute(name)
+        for subject, value in zip(self.subject, attribute.values, strict=True):
             if value is not None:
-                value_of.setdefault(subject, value)
+                values.setdefault(subject, []).append(value)
+        value_from = fmean if attribute.is_numeric else itemgetter(0)
+        value_of = {subject: value_from(known) for subject, known in values.items()}
         return Attribute(name, tuple(value_of.get(subject) for subject in subjects))
 
     def require_constant(self, name: str) -> None:

@@ -263,7 +263,7 @@ def _units(
     regressor = [1.0] * len(pairs) + [0.0] * len(others)
     if is_number:
         values = subjects.attribute(trait).numbers
-        regressor = [float(values[of_subject][0]) for of_subject in rows]
+        regressor = [float(values[of_subject].mean()) for of_subject in rows]
     held = [subjects.by_subject(name, names).columns for name in adjust]
     design = np.column_stack([regressor, np.ones(len(names)), *held])
     complete = finite_rows(design)

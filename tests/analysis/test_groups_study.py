@@ -46,6 +46,23 @@ def test_group_effects__a_planted_difference_is_found_and_nothing_else():
     assert (one["effect_p_adjusted"].sel(quantity=rest) > 0.05).all()
 
 
+def test_group_effects__numbers_that_differ_within_subjects_are_averaged_like_values():
+    """A value that is measured at every visit, on which albedo depends."""
+    rng = np.random.default_rng(4)
+    hydration = np.repeat(rng.normal(50, 10, 20), 3) + rng.normal(0, 10, 60)
+    cohort = planted_tables(
+        np.repeat(_people(20), 3).tolist(),
+        albedo=0.002 * hydration,
+        spread=0.0,
+        hydration=hydration,
+    )
+    found = _compare(cohort, "hydration").sel(quantity=FACE_R)
+    assert abs(found["effect"].item() - 0.002) < 1e-4
+    crossover = cohort.assign_coords(dose=("take", [0.0, 5.0, 10.0] * 20))
+    with pytest.raises(InputError, match="only 5"):
+        _compare(crossover, "dose")
+
+
 def test_group_effects__refuse_what_differs_within_subjects():
     """A crossover is compared within subjects, by a model."""
     arms = np.array(["b", "c", "c", "b"] * 10)
