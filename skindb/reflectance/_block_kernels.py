@@ -60,7 +60,10 @@ class Tables(NamedTuple):
 @kernel
 def _block_narrow(half_width: Vector, narrowest: float, work: FitMemory) -> None:
     """Block the columns that are narrower than an angle, except the widest."""
-    limit = min(narrowest, half_width.max())
+    widest = 0.0
+    for j in range(half_width.shape[0]):
+        widest = max(widest, half_width[j])
+    limit = min(narrowest, widest)
     for j in range(half_width.shape[0]):
         work.blocked[j] = half_width[j] < limit
 

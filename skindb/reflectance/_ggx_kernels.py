@@ -293,12 +293,17 @@ def _write_covariance(
     inverse[1, 1] = by_strength / determinant
     inverse[0, 1] = -cross / determinant
     inverse[1, 0] = inverse[0, 1]
-    spread = np.dot(np.dot(inverse, meat), inverse) * count / (count - 2)
-    push = np.dot(inverse, shift)
+    # sums are written out, because products of arrays take seconds to compile
     scale = (1.0, x[ROUGHNESS])  # of log alpha to alpha
+    more = count / (count - 2)
     for j in range(2):
         for k in range(2):
-            out[j, k] = scale[j] * scale[k] * (spread[j, k] + push[j] * push[k])
+            spread = 0.0
+            for p in range(2):
+                for q in range(2):
+                    product = more * meat[p, q] + shift[p] * shift[q]
+                    spread += inverse[j, p] * product * inverse[k, q]
+            out[j, k] = scale[j] * scale[k] * spread
 
 
 @kernel
@@ -321,7 +326,7 @@ def _add_turned(
     for q in range(4):
         write_cosines(normals[q], options.eta, 0.0, b)
         write_lobe(block.diffuse[s], count, index, b, lobe)
-        moved[:] = x
+        moved[STRENGTH], moved[ROUGHNESS] = x[STRENGTH], x[ROUGHNESS]
         _descend(count, moved, lobe)
         add_scatter(moved, x, out.covariance[s])
     write_cosines(block.normal[s], options.eta, MIN_COSINE_SURFACE, b)
