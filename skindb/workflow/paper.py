@@ -433,6 +433,7 @@ def _edits(source: Source, picture: Path) -> list[str]:
     return [
         "Each trait is added with the strengths 0.5 and 1, also to a face that has it.",
         f"Distance from the nearest take, above 1 outside the data: {', '.join(words)}.",
+        *(f"The takes have no {name}." for name in TRAITS if name not in chosen),
     ]
 
 

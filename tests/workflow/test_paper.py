@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 
 from skindb import workflow
 from skindb.errors import InputError
@@ -56,6 +57,25 @@ def test_reproduce__prints_the_means_and_variances_of_the_study(
         np.testing.assert_allclose(float(row[3]), at["sigma_tr_mean"], rtol=1e-3)
         np.testing.assert_allclose(float(row[4]), at["sigma_tr_variance"], rtol=1e-3)
         assert float(row[5]) == published
+
+
+def test_edits__name_the_traits_that_the_takes_do_not_have(
+    fitted_database, tmp_path, monkeypatch
+):
+    found = xr.Dataset(coords={"trait": ["condition:lotion", "age"]})
+    found = xr.DataTree.from_dict({"traits": found})
+    # both need the whole dictionary
+    monkeypatch.setattr(paper, "study", lambda *_, **__: found)
+    monkeypatch.setattr(paper, "edit_grid", lambda *_, **__: {})
+    source = paper.Source(
+        fitted_database, fitted_database.table(), "S01", None, paper.silent
+    )
+    lines = paper._edits(source, tmp_path / "figure.png")
+    assert lines[-3:] == [
+        "The takes have no beard_density.",
+        "The takes have no ancestry:european.",
+        "The takes have no condition:tan.",
+    ]
 
 
 def test_reproduce__refuses_a_database_without_models(tmp_path):
