@@ -175,7 +175,7 @@ class Quantities:
             repeated = repeated / np.sqrt(np.maximum(count, 1))
             stated: Array | float = np.nan
             if errors is not None:
-                stated = np.stack([_mean_error(errors[rows]) for rows in takes])
+                stated = np.stack([mean_error(errors[rows]) for rows in takes])
             errors = np.fmax(stated, repeated)
         return replace(self, values=values, subject=names, errors=errors)
 
@@ -201,7 +201,7 @@ class Quantities:
         return replace(self, values=self.values[rows], subject=subject, errors=errors)
 
 
-def _mean_error(errors: Array) -> Array:
+def mean_error(errors: Array) -> Array:
     """Standard error of the mean of values with independent errors (n, ...)."""
     count = np.isfinite(errors).sum(axis=0)
     return np.asarray(np.sqrt(known_mean(errors**2) / np.maximum(count, 1)))

@@ -9,7 +9,7 @@ the subjects. The value alone can name a trait if no other attribute has this va
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from statistics import fmean
@@ -256,17 +256,21 @@ class Groups:
 
     def moments(self, values: Array) -> Moments:
         """Moments (group, ...), over subjects, of values (take, ...)."""
-        return Moments.stacked(
-            Moments.of(self._of_subjects(values, rows))
-            for rows in self.members.values()
-        )
+        return Moments.stacked(map(Moments.of, self.of_subjects(values)))
 
-    def _of_subjects(self, values: Array, rows: Sequence[int]) -> Array:
-        """Means (subject, ...) over the takes of each subject in these rows."""
-        of_subject: dict[str, list[int]] = {}
-        for row in rows:
-            of_subject.setdefault(self.subject[row], []).append(row)
-        return np.stack([known_mean(values[takes]) for takes in of_subject.values()])
+    def of_subjects(
+        self, values: Array, average: Callable[[Array], Array] = known_mean
+    ) -> list[Array]:
+        """Averages (subject, ...) over the takes of each subject, of every group."""
+        groups = []
+        for rows in self.members.values():
+            of_subject: dict[str, list[int]] = {}
+            for row in rows:
+                of_subject.setdefault(self.subject[row], []).append(row)
+            groups.append(
+                np.stack([average(values[takes]) for takes in of_subject.values()])
+            )
+        return groups
 
 
 def grouped(cohort: Dataset, group_by: str | None) -> Groups:

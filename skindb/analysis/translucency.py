@@ -9,10 +9,10 @@ from xarray import Dataset
 
 from skindb import plots
 from skindb.analysis.contrasts import FEW
-from skindb.analysis.quantities import trusted, within_deviation
+from skindb.analysis.quantities import mean_error, trusted, within_deviation
 from skindb.analysis.study import Study, of_cohort, table_of
 from skindb.analysis.subjects import Groups, grouped
-from skindb.errors import require
+from skindb.errors import counted, require
 from skindb.numerics.statistics import SUMMARY, known_mean
 from skindb.schema import ProbeStatus, dataset, variables
 from skindb.schema.cohort import require_comparable
@@ -96,7 +96,10 @@ def translucency_table(cohort: Dataset, *, group_by: str | None = None) -> Datas
     moments = groups.moments(sigma_tr)
     variance = moments.variance
     measurement_error = _rms(groups, noise)
-    explained = measurement_error**2 / np.where(variance > 0, variance, np.nan)
+    # of the means over the takes of subjects, whose variance it is
+    errors = groups.of_subjects(noise, mean_error)
+    explained = np.stack([known_mean(of_means**2) for of_means in errors])
+    explained = explained / np.where(variance > 0, variance, np.nan)
     repeats = [
         within_deviation(sigma_tr[rows], [groups.subject[row] for row in rows])
         for rows in groups.members.values()
@@ -128,9 +131,9 @@ def describe_translucency(table: Dataset) -> list[str]:
         if count.size and 0 < (largest := int(count.max())) < FEW:
             low = (table[variables.SIGMA_TR_MEAN_LOW].sel(group=group) < 0).any()
             ends = "; some reach below 0, where sigma_tr cannot be" if low else ""
-            takes = f"{largest} take{'s' if largest > 1 else ''}"
+            people = counted(largest, "subject")
             lines.append(
-                f"{group}: {takes}; with fewer than {FEW} the intervals assume normal values{ends}"
+                f"{group}: {people}; with fewer than {FEW} the intervals assume normal values{ends}"
             )
     return lines
 

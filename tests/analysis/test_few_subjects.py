@@ -168,7 +168,7 @@ def test_describe_translucency__names_small_groups_and_impossible_intervals():
     assert [
         line
         for line in lines
-        if line.startswith("male: 2 takes; with fewer than 10 the intervals")
+        if line.startswith("male: 2 subjects; with fewer than 10 the intervals")
     ]
     assert "some reach below 0" in lines[-1]
     assert not any(line.startswith("female") for line in lines)
