@@ -13,6 +13,14 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from skindb.errors import input_error
+from skindb.geometry._atlas_kernels import (
+    EDGE,
+    TINY,
+    interpolate,
+    pulled,
+    pushed,
+    rasterise,
+)
 from skindb.geometry.mesh import (
     boundary_loops,
     edge_table,
@@ -47,11 +55,6 @@ TRIANGLES_PER_BLOCK = 1 << 17  # takes 50 MB
 # relative to the summed products: the sign of a larger difference is correct (Shewchuk
 # 1997)
 CERTAIN = 3.4e-16
-PARALLEL = 1e-99  # slope of a weight that does not change along a line
-EDGE = 1e-9  # texels; a texel centre on an edge belongs to both triangles
-TEXELS_PER_BLOCK = 1 << 15  # 200 bytes each
-TEXEL_ROWS = 16  # of a map that are interpolated together
-TINY = np.finfo(np.float64).tiny
 Image = Float32
 
 
@@ -395,46 +398,15 @@ def rasterise_atlas(uv: Array, faces: Faces, size: int) -> tuple[Index32, Image]
     """
     face = np.full((size, size), -1, np.int32)
     weight = np.zeros((size, size, 3), np.float32)
-    corner = size * float64(uv).T[:, faces.T] - 0.5  # texel centres become integers
+    corner = size * float64(uv)[faces] - 0.5  # texel centres become integers
     low = np.ceil(corner.min(axis=1) - EDGE).clip(0, size).astype(np.int64)
     high = np.floor(corner.max(axis=1) + EDGE).clip(-1, size - 1).astype(np.int64)
-    width, height = np.maximum(high + 1 - low, 0)
+    sides = np.maximum(high + 1 - low, 0)
     corner -= low[:, None]
-    double_area, error = _double_areas(corner.T)
-    height[~(np.abs(double_area) > error)] = 0
-    blocks = np.flatnonzero(np.diff(np.cumsum(width * height) // TEXELS_PER_BLOCK)) + 1
-    # a texel under several triangles is written last by the first one
-    for block in np.split(np.arange(len(faces)), blocks)[::-1]:
-        block = block[::-1]
-        line, row = _runs(height[block])
-        after = np.roll(corner[..., block], -1, axis=1)
-        before = np.roll(after, -1, axis=1)
-        # the weights of the corners are linear in column and row
-        slope, down = (before - after)[::-1]
-        share = after[1] * before[0] - after[0] * before[1]
-        slope, down, share = (
-            np.stack([slope, down, share])[..., line] / double_area[block[line]]
-        )
-        share -= down * row
-        slope[slope == 0] = PARALLEL
-        end = (-EDGE - share) / slope
-        last = width[block[line]] - 1
-        first = np.ceil(np.where(slope > 0, end, 0).max(axis=0)).clip(0, last + 1)
-        last = np.floor(np.where(slope < 0, end, last).min(axis=0)).clip(-1, last)
-        texel, column = _runs(np.maximum(last + 1 - first, 0).astype(np.int64))
-        column += first[texel].astype(np.int64)
-        share = (share[:, texel] + slope[:, texel] * column).clip(min=0)
-        triangle = block[line[texel]]
-        place = low[1, triangle] + row[texel], low[0, triangle] + column
-        face[place] = triangle
-        weight[place] = (share / share.sum(axis=0)).T
+    double_area, error = _double_areas(corner)
+    sides[~(np.abs(double_area) > error)] = 0
+    rasterise(corner, double_area, low, sides, face, weight)
     return face, weight
-
-
-def _runs(count: Index) -> tuple[Index, Index]:
-    """Index of each of `count` (n,) repetitions of n elements, and its place among them."""
-    index = np.repeat(np.arange(len(count)), count)
-    return index, np.arange(len(index)) - np.repeat(np.cumsum(count) - count, count)
 
 
 def atlas_values(
@@ -461,21 +433,10 @@ def atlas_values(
         (size, size): mean trust of the corners, 0 outside.
     """
     face, weight = raster
-    known = float64(np.where(trust[:, None] > 0, values, 0))
+    finite = float64(np.where(trust[:, None] > 0, values, 0))
     image = np.zeros((*face.shape, values.shape[1]), np.float32)
     confidence = np.zeros(face.shape, np.float32)
-    for start in range(0, len(face), TEXEL_ROWS):
-        rows = slice(start, start + TEXEL_ROWS)
-        corners = faces[face[rows]]  # of any triangle outside, where all weights are 0
-        trusted = float64(weight[rows]) * trust[corners]
-        total = trusted @ np.ones(3)
-        texels = np.arange(total.size + 1) * 3
-        matrix = sp.csr_array(
-            (trusted.ravel(), corners.ravel(), texels), (total.size, len(known))
-        )
-        mixed = (matrix @ known).reshape(*total.shape, -1)
-        image[rows] = mixed / np.maximum(total, TINY)[..., None]
-        confidence[rows] = total
+    interpolate(finite, float64(trust), faces, face, weight, image, confidence)
     return image, confidence
 
 
@@ -496,40 +457,19 @@ def push_pull(image: Array, confidence: AnyArray) -> Image:
     """
     weight = np.nan_to_num(np.clip(float64(confidence), 0, 1))
     weight[~finite_rows(image)] = 0
-    filled = np.full(image.shape, np.nan, np.float32)
     if not weight.any():
-        return filled
-    weights = [weight]
-    while max(weights[-1].shape) > 1:
-        weights.append(np.minimum(_pulled(weights[-1]), 1))
-    for channel in range(image.shape[-1]):
-        levels = [np.where(weight > 0, float64(image[..., channel]), 0)]
-        for fine in weights[:-1]:
-            levels.append(_pulled(fine * levels[-1]) / np.maximum(_pulled(fine), TINY))
-        filled[..., channel] = _pushed(levels, weights)
+        return np.full(image.shape, np.nan, np.float32)
+    levels = [(np.asarray(image, np.float32), weight)]
+    while max(weight.shape) > 1:
+        means, total = pulled(*levels[-1])
+        means /= np.maximum(total, TINY)[..., None]
+        weight = np.minimum(total, 1)
+        levels.append((means.astype(np.float32), weight))
+    filled, _ = levels.pop()
+    while levels:
+        around = np.pad(filled, ((1, 1), (1, 1), (0, 0)), "edge")
+        filled = pushed(around, *levels.pop())
     return filled
-
-
-def _pulled(plane: Float64) -> Float64:
-    """Sums of 2 x 2 texels, fewer at an odd border."""
-    height, width = plane.shape
-    rows = plane[::2].copy()
-    rows[: height // 2] += plane[1::2]
-    sums = rows[:, ::2].copy()
-    sums[:, : width // 2] += rows[:, 1::2]
-    return sums
-
-
-def _pushed(levels: list[Float64], weights: list[Float64]) -> Float64:
-    """The finest level, each blended by its weights with the interpolated coarser one."""
-    out = levels[-1]
-    for plane, weight in zip(levels[-2::-1], weights[-2::-1], strict=True):
-        for axis, side in enumerate(weight.shape):
-            near = np.arange(side) // 2
-            far = (near + np.arange(side) % 2 * 2 - 1).clip(0, out.shape[axis] - 1)
-            out = 0.75 * out.take(near, axis) + 0.25 * out.take(far, axis)
-        out += weight * (plane - out)
-    return out
 
 
 def bilinear(image: Array, pixels: Array) -> Float64:

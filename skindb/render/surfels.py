@@ -125,7 +125,7 @@ def texel_codes(
         open_to_border[piece], TexelStatus.OUTSIDE, TexelStatus.OPENING
     ).astype(np.uint8)
     on = ~empty
-    codes[on] = code[triangles[face[on], weight[on].argmax(axis=1)]]
+    codes[on] = code[triangles[face[on], weight.argmax(axis=2)[on]]]
     return codes
 
 
