@@ -177,8 +177,8 @@ def linear_model(
 def _even_reflection(
     cohort: Dataset, quantity: str, fits: dict[str, _Fit]
 ) -> list[str]:
-    """Widen the intervals of conditions by the error of even reflection, and withhold p
-    values of effects within it, which are named.
+    """Widen the intervals of conditions, and of contrasts that contain them, by the error
+    of even reflection, and withhold p values of effects within it, which are named.
     """
     flags = []
     with suppress(InputError):  # of conditions of different subjects, and of delta E
@@ -189,20 +189,28 @@ def _even_reflection(
             for name, error in zip(
                 contrast.quantities.names, np.ravel(contrast.even), strict=True
             ):
-                if name not in fits or term not in fits[name].table.index:
+                if name not in fits or term not in fits[name].terms:
                     continue
                 table = fits[name].table
-                estimate = table.loc[term, variables.MODEL_ESTIMATE]
-                for end in COLUMNS[2:4]:
-                    half = table.loc[term, end] - estimate
-                    table.loc[term, end] = estimate + np.copysign(
-                        np.hypot(half, error), half
-                    )
-                if abs(estimate) < error:
-                    table.loc[term, variables.MODEL_P] = np.nan
-                    flags.append(
-                        f"{name}: even reflection may cause the effect of {term}"
-                    )
+                terms = fits[name].terms
+                for row in table.index:
+                    factor = float(row == term)
+                    if row not in terms:
+                        factor = sum_of(row, terms)[terms.index(term)]
+                    width = error * abs(factor)
+                    if not width:
+                        continue
+                    estimate = table.loc[row, variables.MODEL_ESTIMATE]
+                    for end in COLUMNS[2:4]:
+                        half = table.loc[row, end] - estimate
+                        table.loc[row, end] = estimate + np.copysign(
+                            np.hypot(half, width), half
+                        )
+                    if abs(estimate) < width:
+                        table.loc[row, variables.MODEL_P] = np.nan
+                        flags.append(
+                            f"{name}: even reflection may cause the effect of {row}"
+                        )
     return flags
 
 
@@ -244,7 +252,9 @@ def _late_baselines(rows: pd.DataFrame) -> set[str]:
 class _Fit:
     """A model of one region and channel."""
 
-    table: pd.DataFrame  # term -> variables of COLUMNS except the false discovery rate
+    # term or contrast -> variables of COLUMNS except the false discovery rate
+    table: pd.DataFrame
+    terms: list[str]  # names, without contrasts
     deviation: dict[str, float]  # random effect, or the residual -> standard deviation
     takes: int
     subjects: int
@@ -333,6 +343,7 @@ def _fit(
     ]
     return _Fit(
         table,
+        terms,
         dict(zip([*effects, RESIDUAL], scale * spread, strict=True)),
         len(rows),
         people,

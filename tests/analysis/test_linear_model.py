@@ -626,8 +626,15 @@ def test_linear_model__of_conditions_contains_even_reflection():
         take=[*names, *(f"{name}.lotion" for name in names)],
         fit_even_reflection_error=("take", np.repeat([0.01, 0.012], 20)),
     )
-    found = linear_model(cohort, formula="R_d ~ condition + (1 | subject)")
+    twice = "2 * condition[T.lotion] + Intercept - Intercept"
+    found = linear_model(
+        cohort, formula="R_d ~ condition + (1 | subject)", contrasts=[twice]
+    )
     one = found.sel(quantity="R_d face G", term="condition[T.lotion]")
+    double = found.sel(quantity="R_d face G", term=twice)
+    for name in ("model_estimate_low", "model_estimate_high"):
+        np.testing.assert_allclose(double[name], 2 * one[name])
+    assert np.isnan(double["model_p"])
     half = one["model_estimate_high"] - one["model_estimate"]
     expected = np.hypot(1.96 * np.hypot(0.01, 0.012), 2.093 * one["model_error"])
     np.testing.assert_allclose(half, expected, rtol=1e-3)
