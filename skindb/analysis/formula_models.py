@@ -168,17 +168,18 @@ def linear_model(
         else "use fewer terms, or add takes",
     )
     if not model.is_log and CONDITION in used:
-        flags += _even_reflection(cohort, model.quantity, fits)
+        flags += _even_reflection(cohort, model.quantity, fits, margin)
     compared = "" if CONDITION in used else ", ".join([NORMAL, *doses])
     stated = {"formula": formula, "margin": margin, "condition": compared}
     return _labelled(fits, flags, cohort, stated)
 
 
 def _even_reflection(
-    cohort: Dataset, quantity: str, fits: dict[str, _Fit]
+    cohort: Dataset, quantity: str, fits: dict[str, _Fit], margin: float | None
 ) -> list[str]:
     """Widen the intervals of conditions, and of contrasts that contain them, by the error
-    of even reflection, and withhold p values of effects within it, which are named.
+    of even reflection, which also narrows margins of equivalence, and withhold p values
+    of effects within it, which are named.
     """
     flags = []
     with suppress(InputError):  # of conditions of different subjects, and of delta E
@@ -205,6 +206,12 @@ def _even_reflection(
                         half = table.loc[row, end] - estimate
                         table.loc[row, end] = estimate + np.copysign(
                             np.hypot(half, width), half
+                        )
+                    if margin is not None:
+                        deviation = table.loc[row, variables.MODEL_ERROR]
+                        table.loc[row, variables.MODEL_P_EQUIVALENCE] = stats.t.sf(
+                            (margin - abs(estimate) - width) / deviation,
+                            table.loc[row, variables.MODEL_DEGREES_OF_FREEDOM],
                         )
                     if abs(estimate) < width:
                         table.loc[row, variables.MODEL_P] = np.nan
