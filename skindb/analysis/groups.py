@@ -21,7 +21,12 @@ from skindb.analysis.contrasts import (
     compare_groups,
     contrast_counts,
 )
-from skindb.analysis.quantities import SURFACE, Quantities, quantities_of
+from skindb.analysis.quantities import (
+    SURFACE,
+    TYPOLOGY_ANGLE,
+    Quantities,
+    quantities_of,
+)
 from skindb.analysis.study import Study, Table, of_cohort, skipped_takes, table_of
 from skindb.analysis.subjects import notes_on_attributes, subjects_of
 from skindb.errors import InputError, few_names
@@ -206,8 +211,11 @@ def _percent(
     """Effects and ends of intervals in per cent, including the error of the level that
     all takes have in common.
 
-    A decrease is at most 100 %; the upper end is NaN where the true level may be 0.
+    A decrease is at most 100 %; the upper end is NaN where the true level may be 0. Angles
+    have none, and are negative for dark skin.
     """
+    is_angle = np.char.startswith(quantities.names, TYPOLOGY_ANGLE)
+    reference = np.where(is_angle, np.nan, reference)
     lowest = np.maximum(reference - quantities.common, 0.0)
     highest = reference + quantities.common
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -63,6 +63,18 @@ def test_group_effects__numbers_that_differ_within_subjects_are_averaged_like_va
         _compare(crossover, "dose")
 
 
+def test_group_effects__angles_have_no_effect_in_per_cent():
+    """Of dark skin, whose angle is negative: an increase would be a decrease in per cent."""
+    gender = ["female", "male"] * 10
+    cohort = planted_tables(_people(20), albedo=-0.25, gender=gender)
+    found = _compare(cohort, "gender", quantities=("ITA", "L*")).isel(contrast=0)
+    angle = found.sel(quantity="ITA face")
+    assert np.isfinite(angle["effect"])
+    for name in ("effect_percent", "effect_percent_low", "effect_percent_high"):
+        assert np.isnan(angle[name])
+        assert np.isfinite(found[name].sel(quantity="L* face"))
+
+
 def test_group_effects__refuse_what_differs_within_subjects():
     """A crossover is compared within subjects, by a model."""
     arms = np.array(["b", "c", "c", "b"] * 10)
