@@ -19,8 +19,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.random import Generator
-from sklearn.decomposition import FastICA
-from sklearn.exceptions import ConvergenceWarning
 from xarray import Dataset
 
 from skindb import plots
@@ -388,6 +386,10 @@ def _independent(density: Array, rng: Generator) -> Array:
     """Independent components (2, 3) in the principal plane, 1 in green; the one that
     absorbs more red is the first.
     """
+    # take longer to import than most commands run
+    from sklearn.decomposition import FastICA
+    from sklearn.exceptions import ConvergenceWarning
+
     axes = _principal_plane(density).axes
     white = density @ np.linalg.pinv(axes).T
     white -= white.mean(axis=0)

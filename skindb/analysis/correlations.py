@@ -6,8 +6,8 @@ from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy  # scipy.stats takes longer to load, at its first use, than commands run
 from numpy.random import Generator
-from scipy import stats
 from xarray import Dataset
 
 from skindb import plots
@@ -104,7 +104,7 @@ def component_correlations(
     kinds = [name.rpartition(" ")[0] for name in COMPONENTS]
     differ = np.array([kinds[i] != kinds[j] for i, j in pairs])
     discovered = np.full(len(pairs), np.nan)
-    discovered[differ] = stats.false_discovery_control(p[differ])
+    discovered[differ] = scipy.stats.false_discovery_control(p[differ])
     flags = []
     if count.min() < FEW:
         flags.append(f"fewer than {FEW} subjects: there are no intervals")
@@ -157,7 +157,7 @@ def _pair(
     """Correlation, ends of its interval, p value and number of subjects of two columns."""
     x, y = two[finite_rows(two)].T
     # pairs of subjects are drawn anew; all of them are used if there are at most `permutations`
-    p = stats.permutation_test(
+    p = scipy.stats.permutation_test(
         (x,),
         lambda permuted, axis: np.abs(_pearson(permuted, y, axis)),
         permutation_type="pairings",
@@ -168,7 +168,7 @@ def _pair(
     ).pvalue
     low = high = float("nan")
     if len(x) >= FEW:
-        interval = stats.bootstrap(
+        interval = scipy.stats.bootstrap(
             (x, y),
             _pearson,
             paired=True,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
-from scipy import stats
+import scipy  # scipy.stats takes longer to load, at its first use, than commands run
 from xarray import Dataset
 
 from skindb import plots
@@ -209,9 +209,11 @@ def _even_reflection(
                         )
                     if margin is not None:
                         deviation = table.loc[row, variables.MODEL_ERROR]
-                        table.loc[row, variables.MODEL_P_EQUIVALENCE] = stats.t.sf(
-                            (margin - abs(estimate) - width) / deviation,
-                            table.loc[row, variables.MODEL_DEGREES_OF_FREEDOM],
+                        table.loc[row, variables.MODEL_P_EQUIVALENCE] = (
+                            scipy.stats.t.sf(
+                                (margin - abs(estimate) - width) / deviation,
+                                table.loc[row, variables.MODEL_DEGREES_OF_FREEDOM],
+                            )
                         )
                     if abs(estimate) < width:
                         table.loc[row, variables.MODEL_P] = np.nan
@@ -433,8 +435,8 @@ def _inference(
     free = np.where(sums != 0, free, np.inf).min(axis=1)
     # of the term that is known worst; NaN, where it is unknown, is ignored
     reliability = np.fmin.reduce(np.where(sums != 0, reliability, np.nan), axis=1)
-    p = 2 * stats.t.sf(np.abs(estimate / error), free)
-    half = stats.t.ppf(0.975, free) * error
+    p = 2 * scipy.stats.t.sf(np.abs(estimate / error), free)
+    half = scipy.stats.t.ppf(0.975, free) * error
     columns = {
         variables.MODEL_ESTIMATE: estimate,
         variables.MODEL_ERROR: error,
@@ -447,7 +449,7 @@ def _inference(
     if margin is not None:
         # two one-sided tests: the p value of the end of the margin that is nearer
         inside = (margin - np.abs(estimate)) / error
-        columns[variables.MODEL_P_EQUIVALENCE] = stats.t.sf(inside, free)
+        columns[variables.MODEL_P_EQUIVALENCE] = scipy.stats.t.sf(inside, free)
     return pd.DataFrame(columns, [*terms, *contrasts])
 
 
@@ -523,7 +525,7 @@ def _labelled(
     discovered = np.full(p.shape, np.nan)
     for column in range(len(terms)):
         is_known = np.isfinite(p[:, column])
-        discovered[is_known, column] = stats.false_discovery_control(
+        discovered[is_known, column] = scipy.stats.false_discovery_control(
             p[is_known, column]
         )
     if (values[variables.MODEL_RELIABILITY] < MIN_RELIABILITY).any():

@@ -9,7 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import stats
+import scipy  # scipy.stats takes longer to load, at its first use, than commands run
 from xarray import Dataset
 
 from skindb import plots
@@ -166,7 +166,7 @@ def _statistics(comparison: Comparison) -> dict[str, Array]:
     p = test.p
     percent, low, high = _percent(fit, _reference(contrast, fit), contrast.quantities)
     discovered = np.full(len(p), np.nan)
-    discovered[np.isfinite(p)] = stats.false_discovery_control(p[np.isfinite(p)])
+    discovered[np.isfinite(p)] = scipy.stats.false_discovery_control(p[np.isfinite(p)])
     standardised = np.divide(
         fit.slope, fit.spread, out=np.full_like(fit.slope, np.nan), where=fit.spread > 0
     )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import pandas as pd
-from scipy import stats
+import scipy  # scipy.stats takes longer to load, at its first use, than commands run
 from xarray import Dataset
 
 from skindb import plots
@@ -183,9 +183,9 @@ def _degrees_of_freedom(
 def _power(distance: Array, free: Array) -> Array:
     """Power of two-sided t tests at 5 % of effects that are `distance` errors from 0."""
     is_possible = free > 0
-    limit = stats.t.ppf(1 - SIGNIFICANT / 2, np.where(is_possible, free, 1))
+    limit = scipy.stats.t.ppf(1 - SIGNIFICANT / 2, np.where(is_possible, free, 1))
     of_sides = [
-        stats.nct.sf(limit, np.where(is_possible, free, 1), side * distance)
+        scipy.stats.nct.sf(limit, np.where(is_possible, free, 1), side * distance)
         for side in (1, -1)
     ]
     return np.where(is_possible, np.sum(of_sides, axis=0), 0.0)

@@ -7,9 +7,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # scipy.signal takes longer to load, at its first use, than commands run
 from numpy.random import Generator
 from scipy.ndimage import gaussian_filter
-from scipy.signal import resample
 from xarray import Dataset
 
 from skindb.analysis.regions import map_regions
@@ -324,7 +324,9 @@ def _without_octaves(values: Array, octaves: int) -> Array:
 
 def _resized(images: Array, shape: tuple[int, ...]) -> Array:
     """Periodic images (n, h, w) in another size, with the frequencies that both have."""
-    return np.asarray(resample(resample(images, shape[0], axis=1), shape[1], axis=2))
+    for axis, side in enumerate(shape, start=1):
+        images = scipy.signal.resample(images, side, axis=axis)
+    return images
 
 
 def at_surfels(change: Array, uv: Array) -> Array:
