@@ -33,7 +33,7 @@ from skindb.analysis.quantities import quantities_of
 from skindb.analysis.study import Study, Table, of_cohort, skipped_takes, table_of
 from skindb.analysis.subjects import CONDITION, NORMAL
 from skindb.errors import InputError, input_error, require
-from skindb.numerics.statistics import ROUNDING
+from skindb.numerics.statistics import ROUNDING, known_mean
 from skindb.parameters import require_limits
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
@@ -167,15 +167,15 @@ def linear_model(
         if any(WITHOUT in reason for reason in reasons)
         else "use fewer terms, or add takes",
     )
-    if not model.is_log and CONDITION in used:
-        flags += _even_reflection(cohort, model.quantity, fits, margin)
+    if CONDITION in used:
+        flags += _even_reflection(cohort, model, fits, margin)
     compared = "" if CONDITION in used else ", ".join([NORMAL, *doses])
     stated = {"formula": formula, "margin": margin, "condition": compared}
     return _labelled(fits, flags, cohort, stated)
 
 
 def _even_reflection(
-    cohort: Dataset, quantity: str, fits: dict[str, _Fit], margin: float | None
+    cohort: Dataset, model: MixedModel, fits: dict[str, _Fit], margin: float | None
 ) -> list[str]:
     """Widen the intervals of conditions, and of contrasts that contain them, by the error
     of even reflection, which also narrows margins of equivalence, and withhold p values
@@ -184,11 +184,13 @@ def _even_reflection(
     flags = []
     with suppress(InputError):  # of conditions of different subjects, and of delta E
         for contrast in contrasts_of(
-            cohort, CONDITION, (), partial(quantities_of, names=(quantity,))
+            cohort, CONDITION, (), partial(quantities_of, names=(model.quantity,))
         ):
+            before = contrast.before if model.is_log else None
+            level = 1.0 if before is None else np.abs(known_mean(before))
             term = f"{CONDITION}[T.{contrast.name.removesuffix(f' less {NORMAL}')}]"
             for name, error in zip(
-                contrast.quantities.names, np.ravel(contrast.even), strict=True
+                contrast.quantities.names, np.ravel(contrast.even / level), strict=True
             ):
                 if name not in fits or term not in fits[name].terms:
                     continue

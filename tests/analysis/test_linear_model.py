@@ -639,9 +639,17 @@ def test_linear_model__of_conditions_contains_even_reflection():
         np.testing.assert_allclose(double[name], 2 * one[name])
     assert np.isnan(double["model_p"])
     half = one["model_estimate_high"] - one["model_estimate"]
-    expected = np.hypot(1.96 * np.hypot(0.01, 0.012), 2.093 * one["model_error"])
+    even = 1.96 * np.hypot(0.01, 0.012)
+    expected = np.hypot(even, 2.093 * one["model_error"])
     np.testing.assert_allclose(half, expected, rtol=1e-3)
     assert np.isnan(one["model_p"])
     assert one["model_p_equivalence"] > 0.5  # the interval exceeds the margin
     flag = "R_d face G: even reflection may cause the effect of condition[T.lotion]"
     assert flag in found.attrs["flags"]
+    logarithm = linear_model(cohort, formula="log(R_d) ~ condition + (1 | subject)")
+    one = logarithm.sel(quantity="R_d face G", term="condition[T.lotion]")
+    bare = cohort.region_diffuse_reflectance.sel(region="face")[:20, 1]
+    half = one["model_estimate_high"] - one["model_estimate"]
+    expected = np.hypot(even / bare.mean(), 2.093 * one["model_error"])
+    np.testing.assert_allclose(half, expected, rtol=1e-3)
+    assert np.isnan(one["model_p"])
