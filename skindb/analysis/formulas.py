@@ -106,7 +106,7 @@ def with_levels(model: MixedModel, frame: pd.DataFrame) -> pd.DataFrame:
     """The rows, with words and C(NAME) as categories, so that terms mean the same in
     all regions; `InputError` for a word that does not differ.
     """
-    words = {}
+    frame = frame.copy()
     for name in model.names:
         values = frame[name]
         is_number = pd.api.types.is_numeric_dtype(values)
@@ -130,8 +130,8 @@ def with_levels(model: MixedModel, frame: pd.DataFrame) -> pd.DataFrame:
             f"{name} is {', '.join(map(str, levels))} in all of them",
             "omit it",
         )
-        words[name] = pd.Categorical(values, levels)
-    return frame.assign(**words)
+        frame[name] = pd.Categorical(values, levels)
+    return frame
 
 
 def _numbers_in_order(level: object) -> list[tuple[float, str]]:

@@ -294,6 +294,9 @@ def test_linear_model__words_are_in_the_order_of_their_numbers():
     assert terms == ["Intercept", "C[T.week 2]", "C[T.week 10]"]
     numbers = with_levels(model, rows.assign(C=[10.0, -2.0, 1.5] * 2))
     assert numbers["C"].cat.categories.tolist() == [-2.0, 1.5, 10.0]
+    rows = rows.rename(columns={"C": "self"})  # as parameters of methods are called
+    assert with_levels(MixedModel.of("R_d ~ self"), rows)["self"].cat.ordered is False
+    assert rows["self"].dtype != "category"
 
 
 def test_linear_model__a_small_group_of_wide_spread_does_not_seem_to_differ():
