@@ -215,8 +215,8 @@ def _relative_exposure(
     if model.curve.shape[0]:
         _tabulated_response(value, dark, model.curve, model.offset, signal, noise)
         return
-    if dark.shape[0]:
-        black[: dark.shape[0]] = dark
+    for k in range(dark.shape[0]):  # a copy of arrays would take seconds to compile
+        black[k] = dark[k]
     _linear_response(value, black, ONE / np.float32(model.span), signal)
     noise[:] = np.float32(model.variance)
 

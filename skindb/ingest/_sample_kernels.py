@@ -261,7 +261,10 @@ def block_means(image: Cube32, factor: int, out: Cube32) -> None:
                     elif value > -np.inf:
                         out[v, u, c] += value
                         top = max(top, value)
-    out[:] = (out + missing * top) / factor**2
+    for v in range(height):
+        for u in range(width):
+            for c in range(channels):
+                out[v, u, c] = (out[v, u, c] + missing[v, u, c] * top) / factor**2
 
 
 @kernel
