@@ -92,7 +92,7 @@ def _plain(values):
 }
 FIT = SimpleNamespace(__module__="skindb.science")
 NNLS = ("numerics/_nnls_kernels.py", "MIN_PIVOT = 1e-11", "MIN_PIVOT = 1e-12")
-TEXTURE = ("geometry/atlas.py", "0.75 * out", "0.5 * out")
+TEXTURE = ("geometry/_atlas_kernels.py", "0.75 * near", "0.5 * near")
 
 
 @pytest.fixture
