@@ -194,35 +194,35 @@ def _even_reflection(
             ):
                 if name not in fits or term not in fits[name].terms:
                     continue
-                table = fits[name].table
-                terms = fits[name].terms
-                for row in table.index:
+                fit = fits[name]
+                place = fit.terms.index(term)
+                for row in fit.table.index:
                     factor = float(row == term)
-                    if row not in terms:
-                        factor = sum_of(row, terms)[terms.index(term)]
-                    width = error * abs(factor)
-                    if not width:
-                        continue
-                    estimate = table.loc[row, variables.MODEL_ESTIMATE]
-                    for end in COLUMNS[2:4]:
-                        half = table.loc[row, end] - estimate
-                        table.loc[row, end] = estimate + np.copysign(
-                            np.hypot(half, width), half
-                        )
-                    if margin is not None:
-                        deviation = table.loc[row, variables.MODEL_ERROR]
-                        table.loc[row, variables.MODEL_P_EQUIVALENCE] = (
-                            scipy.stats.t.sf(
-                                (margin - abs(estimate) - width) / deviation,
-                                table.loc[row, variables.MODEL_DEGREES_OF_FREEDOM],
-                            )
-                        )
-                    if abs(estimate) < width:
-                        table.loc[row, variables.MODEL_P] = np.nan
+                    if row not in fit.terms:
+                        factor = sum_of(row, fit.terms)[place]
+                    if _widen(fit.table, row, abs(factor) * error, margin):
                         flags.append(
                             f"{name}: even reflection may cause the effect of {row}"
                         )
     return flags
+
+
+def _widen(table: pd.DataFrame, row: str, error: float, margin: float | None) -> bool:
+    """Add an error that takes have in common to a row; whether it may cause the effect,
+    which then has no p value.
+    """
+    estimate, deviation, *ends = table.loc[row, list(COLUMNS[:4])]
+    for name, end in zip(COLUMNS[2:4], ends, strict=True):
+        half = end - estimate
+        table.loc[row, name] = estimate + np.copysign(np.hypot(half, error), half)
+    if margin is not None:
+        inside = (margin - abs(estimate) - error) / deviation
+        free = table.loc[row, variables.MODEL_DEGREES_OF_FREEDOM]
+        table.loc[row, variables.MODEL_P_EQUIVALENCE] = scipy.stats.t.sf(inside, free)
+    is_within = bool(abs(estimate) < error)
+    if is_within:
+        table.loc[row, variables.MODEL_P] = np.nan
+    return is_within
 
 
 def _flags(model: MixedModel, measured: pd.DataFrame, used: pd.DataFrame) -> list[str]:

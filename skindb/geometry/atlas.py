@@ -459,7 +459,7 @@ def push_pull(image: Array, confidence: AnyArray) -> Image:
     weight[~finite_rows(image)] = 0
     if not weight.any():
         return np.full(image.shape, np.nan, np.float32)
-    levels = [(np.asarray(image, np.float32), weight)]
+    levels = [(np.ascontiguousarray(image, np.float32), weight)]
     while max(weight.shape) > 1:
         means, total = pulled(*levels[-1])
         means /= np.maximum(total, TINY)[..., None]
