@@ -32,7 +32,6 @@ from skindb.analysis.subjects import (
     attribute_of,
     comparable_takes,
     has_trait,
-    level_error,
     multiple_correlation,
     require_adjustable,
     subjects_of,
@@ -288,14 +287,6 @@ def _paired(
         names = [trait_of(subjects, group_by).partition(":")[2]]
     quantities = measure(cohort)
     plain = quantities.select(np.flatnonzero(conditions == NORMAL))
-    largest = float(np.nan_to_num(level_error(cohort)))
-    known = [
-        cohort[name].values.astype(float)
-        if name in cohort.coords
-        else np.zeros(len(conditions))
-        for name in (LEVEL, EVEN)
-    ]
-    even = Quantities(np.nan_to_num(np.stack(known, axis=1)), quantities.subject)
     pairs = []
     for name in names:
         changed = quantities.select(np.flatnonzero(conditions == name))
@@ -308,10 +299,6 @@ def _paired(
         if errors is not None and normal.errors is not None:
             errors = np.hypot(errors, normal.errors)
         changes = replace(after, values=after.values - normal.values, errors=errors)
-        levels = [
-            even.select(np.flatnonzero(conditions == word)).of_subjects(both).values
-            for word in (NORMAL, name)
-        ]
         pairs.append(
             Contrast(
                 f"{name} less {NORMAL}",
@@ -319,7 +306,7 @@ def _paired(
                 np.ones(len(both)),
                 np.empty((len(both), 0)),
                 before=normal.values,
-                even=_even_error(quantities, largest, *levels),
+                even=even_errors(cohort, quantities, name),
             )
         )
     require(
@@ -332,16 +319,34 @@ def _paired(
     return pairs
 
 
-def _even_error(
-    quantities: Quantities, largest: float, first: Array, second: Array
-) -> Array:
+def even_errors(cohort: Dataset, quantities: Quantities, condition: str) -> Array:
     """Half-widths (q,) of the 95 % intervals of what even reflection may add to the mean
-    difference of two conditions, from its error and value (subject, 2) in both.
+    difference of a condition from normal, of the subjects who were measured in both, if
+    there are any.
 
     Where both have the same prior, its error cancels, and what was subtracted differs by
     a fraction of the change of the highlights, which is known to about itself; highlights
     may lack as much. Errors of different priors are taken as independent.
     """
+    conditions = cohort[CONDITION].values
+    levels = np.zeros((len(conditions), 2))
+    for column, name in zip(levels.T, (LEVEL, EVEN), strict=True):
+        if name in cohort.coords:
+            column[:] = np.nan_to_num(cohort[name].values.astype(float))
+    largest = levels[:, 0].max()
+    sides = [
+        Quantities(levels, quantities.subject).select(
+            np.flatnonzero(conditions == name)
+        )
+        for name in (NORMAL, condition)
+    ]
+    paired = [name for name in sides[0].subject if name in sides[1].subject]
+    first, second = (
+        side.of_subjects([*dict.fromkeys(paired)]).values
+        if paired
+        else side.values.mean(axis=0, keepdims=True)
+        for side in sides
+    )
     both = np.stack([first[:, 0], second[:, 0]])
     is_same = np.isclose(*both)
     change = float((second - first)[:, 1].mean())

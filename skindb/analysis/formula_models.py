@@ -6,9 +6,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,8 +15,7 @@ import scipy  # scipy.stats takes longer to load, at its first use, than command
 from xarray import Dataset
 
 from skindb import plots
-from skindb.analysis.contrasts import MIN_RELIABILITY
-from skindb.analysis.contrasts import contrasts as contrasts_of
+from skindb.analysis.contrasts import MIN_RELIABILITY, even_errors
 from skindb.analysis.formulas import (
     SUBJECT,
     MixedModel,
@@ -29,7 +26,7 @@ from skindb.analysis.formulas import (
 )
 from skindb.analysis.long_form import COLUMNS as VALUES
 from skindb.analysis.long_form import INTERCEPT, tidy
-from skindb.analysis.quantities import quantities_of
+from skindb.analysis.quantities import QUANTITIES, quantities_of
 from skindb.analysis.study import Study, Table, of_cohort, skipped_takes, table_of
 from skindb.analysis.subjects import CONDITION, NORMAL
 from skindb.errors import InputError, input_error, require
@@ -167,8 +164,7 @@ def linear_model(
         if any(WITHOUT in reason for reason in reasons)
         else "use fewer terms, or add takes",
     )
-    if CONDITION in used:
-        flags += _even_reflection(cohort, model, fits, margin)
+    flags += _even_reflection(cohort, model, fits, margin)
     compared = "" if CONDITION in used else ", ".join([NORMAL, *doses])
     stated = {"formula": formula, "margin": margin, "condition": compared}
     return _labelled(fits, flags, cohort, stated)
@@ -177,33 +173,27 @@ def linear_model(
 def _even_reflection(
     cohort: Dataset, model: MixedModel, fits: dict[str, _Fit], margin: float | None
 ) -> list[str]:
-    """Widen the intervals of conditions, and of contrasts that contain them, by the error
-    of even reflection, which also narrows margins of equivalence, and withhold p values
-    of effects within it, which are named.
+    """Widen intervals by what errors of even reflection in the conditions add to terms
+    and contrasts, which also narrows margins of equivalence, and withhold p values of
+    effects within it, which are named.
     """
     flags = []
-    with suppress(InputError):  # of conditions of different subjects, and of delta E
-        for contrast in contrasts_of(
-            cohort, CONDITION, (), partial(quantities_of, names=(model.quantity,))
-        ):
-            before = contrast.before if model.is_log else None
-            level = 1.0 if before is None else np.abs(known_mean(before))
-            term = f"{CONDITION}[T.{contrast.name.removesuffix(f' less {NORMAL}')}]"
-            for name, error in zip(
-                contrast.quantities.names, np.ravel(contrast.even / level), strict=True
-            ):
-                if name not in fits or term not in fits[name].terms:
-                    continue
-                fit = fits[name]
-                place = fit.terms.index(term)
-                for row in fit.table.index:
-                    factor = float(row == term)
-                    if row not in fit.terms:
-                        factor = sum_of(row, fit.terms)[place]
-                    if _widen(fit.table, row, abs(factor) * error, margin):
-                        flags.append(
-                            f"{name}: even reflection may cause the effect of {row}"
-                        )
+    # a unit for each condition, independent of the others
+    squares = {name: np.zeros(len(fit.table)) for name, fit in fits.items()}
+    conditions = {*cohort[CONDITION].values.tolist()}
+    if model.quantity in QUANTITIES and NORMAL in conditions:
+        quantities = quantities_of(cohort, (model.quantity,))
+        normal = quantities.select(np.flatnonzero(cohort[CONDITION].values == NORMAL))
+        level = np.abs(known_mean(normal.values)) if model.is_log else 1.0
+        for condition in sorted(conditions - {NORMAL}):
+            errors = even_errors(cohort, quantities, condition) / level
+            for name, error in zip(quantities.names, errors, strict=True):
+                if name in fits and condition in fits[name].shifts:
+                    squares[name] += (fits[name].shifts[condition] * error) ** 2
+    for name, fit in fits.items():
+        for row, error in zip(fit.table.index, np.sqrt(squares[name]), strict=True):
+            if _widen(fit.table, row, error, margin):
+                flags.append(f"{name}: even reflection may cause the effect of {row}")
     return flags
 
 
@@ -265,7 +255,8 @@ class _Fit:
 
     # term or contrast -> variables of COLUMNS except the false discovery rate
     table: pd.DataFrame
-    terms: list[str]  # names, without contrasts
+    # of the same rows: what values that rise by 1 in a condition add
+    shifts: pd.DataFrame
     deviation: dict[str, float]  # random effect, or the residual -> standard deviation
     takes: int
     subjects: int
@@ -333,7 +324,12 @@ def _fit(
     )
     scale = float(np.std(y))  # so that the solver converges
     try:
-        estimate, covariance, spread = _solve(y / scale, x, groups, random)
+        conditions = sorted({*rows[CONDITION]} - {NORMAL})
+        condition = rows[CONDITION].to_numpy(str)
+        rises = 1.0 * np.equal.outer(condition, np.array(conditions, str))
+        estimate, covariance, spread, shifts = _solve(
+            y / scale, x, groups, random, rises
+        )
     except np.linalg.LinAlgError:
         raise input_error(
             "formula", "must be determined", "no maximum of the likelihood was found"
@@ -341,7 +337,9 @@ def _fit(
     reliability = _reliability(rows, is_constant_within(x, subjects), model.is_log)
     reliability[np.array(terms) == INTERCEPT] = np.nan
     fitted = (scale * estimate, scale**2 * covariance, free, reliability)
-    table = _inference(fitted, terms, contrasts, margin)
+    contrasts = [name for name in dict.fromkeys(contrasts) if name not in terms]
+    sums = np.vstack([np.eye(len(terms)), *(sum_of(name, terms) for name in contrasts)])
+    table = _inference(fitted, sums, margin).set_axis([*terms, *contrasts])
     effects = [INTERCEPT, *model.slopes] if model.is_mixed else []
     size = np.sqrt((random**2).mean(axis=0))  # whatever the units of the slopes are
     if model.nested:
@@ -354,7 +352,7 @@ def _fit(
     ]
     return _Fit(
         table,
-        terms,
+        pd.DataFrame(sums @ shifts, columns=conditions),
         dict(zip([*effects, RESIDUAL], scale * spread, strict=True)),
         len(rows),
         people,
@@ -422,16 +420,13 @@ def _reliability(rows: pd.DataFrame, is_between: Mask, is_log: bool) -> Array:
 
 def _inference(
     fitted: tuple[Array, Array, Array, Array],
-    terms: Sequence[str],
-    contrasts: Sequence[str],
+    sums: Array,
     margin: float | None,
 ) -> pd.DataFrame:
-    """Variables of terms and contrasts, from estimates, covariance, degrees of freedom
+    """Variables of sums (row, p) of terms, from estimates, covariance, degrees of freedom
     and reliability.
     """
     estimate, covariance, free, reliability = fitted
-    contrasts = [name for name in dict.fromkeys(contrasts) if name not in terms]
-    sums = np.vstack([np.eye(len(terms)), *(sum_of(name, terms) for name in contrasts)])
     estimate = sums @ estimate
     error = np.sqrt(np.einsum("ij,jk,ik->i", sums, covariance, sums))
     free = np.where(sums != 0, free, np.inf).min(axis=1)
@@ -452,7 +447,7 @@ def _inference(
         # two one-sided tests: the p value of the end of the margin that is nearer
         inside = (margin - np.abs(estimate)) / error
         columns[variables.MODEL_P_EQUIVALENCE] = scipy.stats.t.sf(inside, free)
-    return pd.DataFrame(columns, [*terms, *contrasts])
+    return pd.DataFrame(columns)
 
 
 def _numbers(rows: pd.DataFrame, name: str) -> Array:
@@ -466,13 +461,15 @@ def _numbers(rows: pd.DataFrame, name: str) -> Array:
 
 
 def _solve(
-    y: Array, x: Array, groups: Sequence[Array], random: Array
-) -> tuple[Array, Array, Array]:
-    """Estimates (p,), their covariance (p, p), and standard deviations of the random
-    effects of the first groups, of the other ones, and of the residual.
+    y: Array, x: Array, groups: Sequence[Array], random: Array, rises: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Estimates (p,), their covariance (p, p), standard deviations of the random effects
+    of the first groups, of the other ones, and of the residual, and what `rises` (n, c)
+    of the values add to the estimates (p, c).
     """
     if not groups:
         estimate = np.linalg.lstsq(x, y)[0]
+        shifts = np.linalg.lstsq(x, rises)[0]
         rest = y - x @ estimate
         variance = float((rest**2).sum()) / (len(y) - x.shape[1])
         inverse = np.linalg.inv(x.T @ x)
@@ -480,7 +477,7 @@ def _solve(
         is_alone = free < ALONE  # has a level of its own: HC3 does not know its error
         square = np.where(is_alone, variance, (rest / np.maximum(free, ALONE)) ** 2)
         covariance = inverse @ (x.T * square) @ x @ inverse
-        return estimate, covariance, np.sqrt([variance])
+        return estimate, covariance, np.sqrt([variance]), shifts
     # takes a second to import
     from statsmodels.regression.mixed_linear_model import MixedLM, VCSpec
 
@@ -504,11 +501,14 @@ def _solve(
         fitted = model.fit(method="powell")
     variances = [*map(float, fitted.vcomp), float(fitted.scale)]
     between = np.atleast_2d(np.asarray(fitted.cov_re, float))
-    information = information_of(x, random, groups, between, variances)
+    columns = np.column_stack([x, rises])
+    information = information_of(columns, random, groups, between, variances)
     between = back_random @ between @ back_random.T
     spread = np.sqrt([*np.maximum(np.diag(between), 0), *variances])
     estimate = back @ np.asarray(fitted.fe_params, float)
-    return estimate, back @ np.linalg.inv(information) @ back.T, spread
+    of_terms, of_rises = np.split(information[: x.shape[1]], [x.shape[1]], axis=1)
+    covariance = back @ np.linalg.inv(of_terms)
+    return estimate, covariance @ back.T, spread, covariance @ of_rises
 
 
 def _labelled(

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import statsmodels.formula.api as smf
+import xarray as xr
 from planted_tables import planted_tables
 from scipy import stats
 
@@ -22,7 +23,7 @@ FORMULA = "R_d ~ treatment * visit + age + (1 | subject)"
 
 def _fit(model, rows):
     """Of values without stated errors."""
-    return formula_models._fit(model, rows.assign(error=np.nan))
+    return formula_models._fit(model, rows.assign(error=np.nan, condition="normal"))
 
 
 def planted(*, effect=0.0, slope=0.0, seed=5):
@@ -655,4 +656,44 @@ def test_linear_model__of_conditions_contains_even_reflection():
     half = one["model_estimate_high"] - one["model_estimate"]
     expected = np.hypot(even / bare.mean(), 2.093 * one["model_error"])
     np.testing.assert_allclose(half, expected, rtol=1e-3)
+    assert np.isnan(one["model_p"])
+
+
+@pytest.mark.parametrize(
+    ("formula", "is_mixed"),
+    [
+        ("R_d ~ lotion + (1 | subject)", True),
+        ("R_d ~ lotion + week + (1 | subject)", True),
+        ("R_d ~ lotion", False),
+    ],
+)
+def test_linear_model__of_a_dose_that_is_a_condition_contains_even_reflection(
+    formula, is_mixed
+):
+    """As what R_d that rises by the error in that condition adds to the estimate."""
+    names = [f"S{i:02d}" for i in range(20)]
+    keys = names * 2 if is_mixed else [f"S{i:02d}" for i in range(40)]
+    dose = np.where(np.arange(20) % 3, 2.0, 1.0)
+    cohort = planted_tables(
+        keys,
+        conditions=["normal"] * 20 + ["lotion"] * 20,
+        lotion=[*np.full(20, np.nan), *dose],
+        week=[i % 3 for i in range(40)],
+    ).assign_coords(fit_even_reflection_error=("take", np.repeat([0.01, 0.012], 20)))
+    found = linear_model(cohort, formula=formula)
+    error = np.zeros(40)
+    error[20:] = 1.96 * np.hypot(0.01, 0.012)
+    name = "region_diffuse_reflectance"
+    raised = cohort.assign({name: cohort[name] + xr.DataArray(error, dims="take")})
+    one, other = (
+        table.sel(quantity="R_d face G", term="lotion")
+        for table in (found, linear_model(raised, formula=formula))
+    )
+    half = one["model_estimate_high"] - one["model_estimate"]
+    free = float(one["model_degrees_of_freedom"])
+    added = float(other["model_estimate"] - one["model_estimate"])
+    assert added > 0.01
+    known = stats.t.ppf(0.975, free) * float(one["model_error"])
+    # variances differ a little, as the raised values are not those of one dose
+    np.testing.assert_allclose(half, np.hypot(added, known), rtol=1e-2)
     assert np.isnan(one["model_p"])
