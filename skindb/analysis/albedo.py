@@ -22,7 +22,7 @@ from skindb.analysis.study import (
     skipped_takes,
     table_of,
 )
-from skindb.analysis.subjects import grouped, level_error
+from skindb.analysis.subjects import compared_conditions, grouped, level_error
 from skindb.analysis.summary import SAMPLED
 from skindb.errors import counted, require
 from skindb.numerics.statistics import SUMMARY, known_mean
@@ -364,4 +364,5 @@ STUDY = Study(
     plot=lambda table, histograms: plot_albedo(histograms, table=table),
     cohort_options={"surfels": SAMPLED},
     uses_registration=True,
+    conditions=compared_conditions,
 )

@@ -31,7 +31,7 @@ from skindb.analysis.study import (
     skipped_takes,
     table_of,
 )
-from skindb.analysis.subjects import grouped
+from skindb.analysis.subjects import compared_conditions, grouped
 from skindb.analysis.texture import (
     COVERED,
     DARKEST,
@@ -550,4 +550,5 @@ STUDY = Study(
     tabulate=lambda _, table: table_of(table, COLUMNS),
     plot=lambda _, table: plot_chromophores(table),
     describe=lambda axes, _: describe_chromophores(axes),
+    conditions=compared_conditions,
 )

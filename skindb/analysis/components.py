@@ -9,6 +9,7 @@ from xarray import DataArray, Dataset
 
 from skindb.analysis.face_models import ALBEDO, POSITION, face_at, face_model
 from skindb.analysis.study import Study, Table, of_cohort, table_of
+from skindb.analysis.subjects import compared_conditions
 from skindb.render.image import tone_map
 from skindb.schema import variables
 from skindb.study_parameters import DECLARED
@@ -108,5 +109,5 @@ STUDY = Study(
     tabulate=tabulate_face_model,
     plot=plot_face_model,
     describe=describe_face_model,
-    compares_normal=True,
+    conditions=compared_conditions,
 )

@@ -13,7 +13,7 @@ from xarray import Dataset
 from skindb import plots
 from skindb.analysis.quantities import SURFACE, Quantities, quantities_of
 from skindb.analysis.study import Study, of_cohort, skipped_takes, table_of
-from skindb.analysis.subjects import takes_to_compare
+from skindb.analysis.subjects import compared_conditions, takes_to_compare
 from skindb.errors import require
 from skindb.numerics.statistics import known_mean
 from skindb.schema import dataset, variables
@@ -227,5 +227,5 @@ STUDY = Study(
     tabulate=lambda table: table_of(table, COLUMNS),
     plot=plot_correlations,
     describe=describe_correlations,
-    compares_normal=True,
+    conditions=compared_conditions,
 )

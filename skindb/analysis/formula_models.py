@@ -28,7 +28,7 @@ from skindb.analysis.long_form import COLUMNS as VALUES
 from skindb.analysis.long_form import INTERCEPT, tidy
 from skindb.analysis.quantities import QUANTITIES, quantities_of
 from skindb.analysis.study import Study, Table, of_cohort, skipped_takes, table_of
-from skindb.analysis.subjects import CONDITION, NORMAL
+from skindb.analysis.subjects import CONDITION, NORMAL, Subjects
 from skindb.errors import InputError, input_error, require
 from skindb.numerics.statistics import ROUNDING, known_mean
 from skindb.parameters import require_limits
@@ -613,6 +613,14 @@ def plot_model(table: Dataset, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
+def _conditions(subjects: Subjects, parameters: ModelParameters) -> list[str]:
+    """Conditions whose takes a model uses, unless it is of conditions."""
+    model = MixedModel.of(parameters.formula)
+    used = {*model.names, *model.slopes}
+    words = {*map(str, subjects.attribute(CONDITION).values)}
+    return [] if CONDITION in used else [NORMAL, *sorted(used & words)]
+
+
 STUDY = Study(
     *DECLARED["model"],
     layout="tables",
@@ -623,4 +631,5 @@ STUDY = Study(
     describe=describe_model,
     columns_of_files=(variables.MODEL_P_FALSE_DISCOVERY,),
     counts_takes=True,
+    conditions=_conditions,
 )

@@ -28,7 +28,11 @@ from skindb.analysis.quantities import (
     quantities_of,
 )
 from skindb.analysis.study import Study, Table, of_cohort, skipped_takes, table_of
-from skindb.analysis.subjects import notes_on_attributes, subjects_of
+from skindb.analysis.subjects import (
+    compared_conditions,
+    notes_on_attributes,
+    subjects_of,
+)
 from skindb.errors import InputError, few_names
 from skindb.numerics.inference import Effects
 from skindb.numerics.statistics import detectable_difference, known_mean
@@ -426,5 +430,5 @@ STUDY = Study(
         variables.EFFECT_P_FALSE_DISCOVERY,
         variables.EFFECT_DETECTABLE,
     ),
-    compares_normal=True,
+    conditions=compared_conditions,
 )

@@ -34,7 +34,12 @@ from skindb.analysis.study import (
     skipped_takes,
     table_of,
 )
-from skindb.analysis.subjects import level_error, notes_on_attributes, subjects_of
+from skindb.analysis.subjects import (
+    compared_conditions,
+    level_error,
+    notes_on_attributes,
+    subjects_of,
+)
 from skindb.errors import Fault, InputError, require
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_comparable
@@ -387,5 +392,5 @@ STUDY = Study(
     tabulate=tabulate_effect_maps,
     plot=plot_effect_maps,
     describe=describe_effect_maps,
-    compares_normal=True,
+    conditions=compared_conditions,
 )

@@ -26,6 +26,7 @@ from skindb.analysis.formulas import (
 )
 from skindb.analysis.long_form import INTERCEPT
 from skindb.analysis.study import Study, of_cohort, table_of
+from skindb.analysis.subjects import NORMAL
 from skindb.errors import require
 from skindb.parameters import require_limits
 from skindb.schema import dataset, variables
@@ -226,4 +227,5 @@ STUDY = Study(
     plot=plot_plan,
     describe=describe_plan,
     counts_takes=True,
+    conditions=lambda *_: [NORMAL],
 )

@@ -198,4 +198,5 @@ STUDY = Study(
         variables.DETECTABLE_CHANGE_OF_MEAN,
     ),
     counts_takes=True,
+    conditions=lambda _, parameters: [parameters.condition],
 )

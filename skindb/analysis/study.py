@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from skindb.analysis.subjects import Subjects
+
 
 Result = TypeVar("Result")
 Results = dict[str, Dataset]  # group of the stored version -> its variables
@@ -164,9 +166,9 @@ class Study:
         Whether takes with landmarks are registered first, as for maps always.
     absolute
         Whether it needs absolute reflectance.
-    compares_normal
-        Whether it compares subjects in the condition normal, so that those without such
-        a take are reported as skipped.
+    conditions
+        Function of the `Subjects` and of the parameters that returns the conditions whose
+        takes it uses, none for all; subjects without such a take are reported as skipped.
     counts_takes
         Whether visits and repeats of a subject count by themselves, not by their mean.
     """
@@ -184,7 +186,7 @@ class Study:
     cohort_options: Mapping[str, Any] = field(default_factory=dict)
     uses_registration: bool = False
     absolute: bool = False
-    compares_normal: bool = False
+    conditions: Callable[[Subjects, Any], Sequence[str]] = lambda *_: ()
     counts_takes: bool = False
 
     @property

@@ -457,13 +457,20 @@ def comparable_takes(subjects: Subjects, trait: str) -> Mask:
     return np.isin(names, list(paired)) & (carries | plain)
 
 
-def subjects_without_normal(subjects: Subjects) -> list[Note]:
-    """One note for each subject without a take in the condition normal; such subjects
-    are not compared with others.
-    """
-    plain = {subjects.subject[i] for i in np.flatnonzero(subjects.is_normal)}
-    names = [name for name in subjects.names if name not in plain]
-    return [note(subject, "no take in the condition normal") for subject in names]
+def compared_conditions(subjects: Subjects, parameters: Any) -> list[str]:
+    """The condition of a comparison by `group_by`; none where conditions are compared."""
+    group_by = getattr(parameters, "group_by", None)
+    compared = None if group_by is None else attribute_of(subjects, group_by)
+    return [] if compared == CONDITION else [NORMAL]
+
+
+def subjects_without(subjects: Subjects, conditions: Sequence[str]) -> list[Note]:
+    """One note for each subject without a take in one of the conditions, if any are named."""
+    found = zip(subjects.subject, subjects.attribute(CONDITION).values, strict=True)
+    counted = {subject for subject, condition in found if condition in conditions}
+    names = [name for name in subjects.names if conditions and name not in counted]
+    reason = f"no take in the condition {' or '.join(conditions)}"
+    return [note(subject, reason) for subject in names]
 
 
 def numeric_attributes(subjects: Subjects) -> list[str]:

@@ -35,6 +35,7 @@ from skindb.analysis.subjects import (
     OTHER,
     UNKNOWN,
     Subjects,
+    compared_conditions,
     groups_by,
     numeric_attributes,
     subjects_of,
@@ -469,5 +470,5 @@ STUDY = Study(
     plot=plot_space,
     describe=describe_brdf_space,
     cohort_options={"surfels": SAMPLED},
-    compares_normal=True,
+    conditions=compared_conditions,
 )

@@ -11,7 +11,7 @@ from skindb import plots
 from skindb.analysis.contrasts import FEW
 from skindb.analysis.quantities import mean_error, trusted, within_deviation
 from skindb.analysis.study import Study, of_cohort, table_of
-from skindb.analysis.subjects import Groups, grouped
+from skindb.analysis.subjects import Groups, compared_conditions, grouped
 from skindb.errors import counted, require
 from skindb.numerics.statistics import SUMMARY, known_mean
 from skindb.schema import ProbeStatus, dataset, variables
@@ -198,5 +198,5 @@ STUDY = Study(
         variables.SIGMA_TR_TOTAL_ERROR,
         variables.SIGMA_TR_REPEAT_DEVIATION,
     ),
-    compares_normal=True,
+    conditions=compared_conditions,
 )

@@ -28,7 +28,7 @@ from skindb.analysis.subjects import (
     CONDITION,
     describe_visits,
     subjects_of,
-    subjects_without_normal,
+    subjects_without,
 )
 from skindb.errors import InputError, require
 from skindb.files import Attributes
@@ -381,7 +381,7 @@ def study(
             dictionary=dictionary,
         )
         _require_one_scale(db, record, inputs)
-        derivation = _derivation(db, key, record, requested, population, inputs)
+        derivation = _derivation(db, key, record, requested, chosen, population, inputs)
         # the file of a dictionary may change: a study with one is always computed
         if dictionary is not None or derivation.current() is None:
             studied = population.cohort["take"].values.tolist()
@@ -516,15 +516,15 @@ def _derivation(
     key: str,
     record: Study,
     requested: Attributes,
+    chosen: Any,
     population: Population,
     inputs: Sequence[Record],
 ) -> Derivation:
     """Everything that decides the content of a study."""
     cohort = population.cohort
     skipped = list(cohort.attrs["skipped"])
-    compares_conditions = str(requested.get("group_by", "")).startswith(CONDITION)
-    if record.compares_normal and not compares_conditions:
-        skipped += subjects_without_normal(subjects_of(cohort))
+    subjects = subjects_of(cohort)
+    skipped += subjects_without(subjects, record.conditions(subjects, chosen))
     outdated = list(cohort.attrs["outdated"])
     notes = [*skipped, *outdated, *population.notes]
     names = {note["take"] for note in notes if note["take"]}

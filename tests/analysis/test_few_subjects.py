@@ -14,7 +14,7 @@ from skindb.analysis import (
     translucency_table,
 )
 from skindb.analysis.groups import describe_group_effects
-from skindb.analysis.subjects import subjects_of, subjects_without_normal
+from skindb.analysis.subjects import NORMAL, subjects_of, subjects_without
 from skindb.analysis.translucency import describe_translucency
 from skindb.errors import InputError
 from skindb.numerics.inference import effects, permutation_p
@@ -206,6 +206,6 @@ def test_group_effects__older_means_older_than_the_median_of_all_subjects():
     with_it, without = found["effect_count"].isel(contrast=0).max("quantity").values
     # above the median of seven, 50; that of six is 44, with three above
     assert (with_it, without) == (2, 4)
-    assert subjects_without_normal(subjects_of(cohort)) == [
+    assert subjects_without(subjects_of(cohort), [NORMAL]) == [
         {"take": "G", "reason": "no take in the condition normal"}
     ]

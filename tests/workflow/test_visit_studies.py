@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import pytest
 from click.testing import CliRunner
@@ -20,17 +21,17 @@ def db(tmp_path_factory):
     db = Database(tmp_path_factory.mktemp("visits") / "db")
     for number, (subject, gender) in enumerate(PEOPLE.items()):
         for take in (subject, f"{subject}.normal.2"):
-            model = model_of(
-                10 * number + len(take),
-                tint=0.6 + 0.1 * number,
-                subject=subject,
-                traits={"gender": gender},
-            )
-            with db.stage("model", take) as stage:
-                groups = model.children.items()
-                stage.write({name: group.to_dataset() for name, group in groups})
-                stage.commit(model.attrs)
+            tint = 0.6 + 0.1 * number
+            about = {"subject": subject, "traits": {"gender": gender}}
+            _store(db, take, model_of(10 * number + len(take), tint=tint, **about))
     return db
+
+
+def _store(db, take, model):
+    with db.stage("model", take) as stage:
+        groups = model.children.items()
+        stage.write({name: group.to_dataset() for name, group in groups})
+        stage.commit(model.attrs)
 
 
 def analyze(db, *arguments):
@@ -90,3 +91,39 @@ def test_analyze_plan__is_a_stored_study(db, tmp_path):
     assert (rows[0]["quantity"], rows[0]["known_subjects"]) == ("ITA face", 4)
     assert rows[0]["plan_subjects"] >= 2
     assert plot.stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "conditions"),
+    [
+        (["groups", "--group-by", "gender"], "normal"),
+        (["albedo", "--group-by", "gender"], "normal"),
+        (["repeatability"], "normal"),
+        (["model", "ITA ~ gender + (1 | subject)"], "normal"),
+        (["model", "ITA ~ visit + powder + (1 | subject)"], "normal or powder"),
+        (["plan", "ITA ~ treatment + (1 | subject)", "--visits", "2"], "normal"),
+        (["translucency", "--group-by", "lotion"], ""),
+        (["model", "ITA ~ condition + (1 | subject)"], ""),
+    ],
+)
+def test_analyze__names_subjects_without_a_take_that_counts(
+    db, tmp_path, arguments, conditions
+):
+    other = Database(shutil.copytree(db.root, tmp_path / "db"))
+    for subject, condition in [("B", "powder"), ("C", "powder"), ("E", "lotion")]:
+        model = model_of(
+            7,
+            tint=0.5 + 0.1 * len(condition),
+            subject=subject,
+            condition=condition,
+            traits={"gender": "male", "powder": 2.0},
+        )
+        _store(other, f"{subject}.{condition}", model)
+    report = json.loads(analyze(other, *arguments, "--json"))
+    found = [
+        line["take"] for line in report["skipped"] if "condition" in line["reason"]
+    ]
+    assert found == (["E"] if conditions else [])
+    if conditions:
+        reason = report["skipped"][0]["reason"]
+        assert reason == f"no take in the condition {conditions}"
