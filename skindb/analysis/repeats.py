@@ -68,8 +68,9 @@ def repeatability(
         (quantity,), see the variables of the group "repeatability". sigma_tr is
         compared by its natural logarithm. `icc` is ICC(1), the fraction of the variance
         that is between subjects, from all takes; `icc_agreement` is ICC(2,1), from the
-        subjects with a value at every visit and repeat, whose common changes count as
-        variance; each with a 95 % interval. The repeatability coefficient,
+        visits and repeats of at least half of the repeated subjects, and the subjects
+        with a value at each of them; common changes count as variance. Both have a 95 %
+        interval. The repeatability coefficient,
         1.96 sqrt(2) times the standard deviation within subjects, is also the smallest
         detectable change of one subject. The limits of agreement are those of the
         second take less the first. NaN where fewer than three subjects have two values.
@@ -138,7 +139,9 @@ def _statistics(
     one_way = intraclass_correlation(values[known], subjects[known])
     columns = [measured.subject, *zip(*occasions, strict=True)]
     keys = pd.MultiIndex.from_arrays(columns)
-    table = pd.Series(values, keys).unstack([1, 2]).dropna()
+    table = pd.Series(values, keys).unstack([1, 2])
+    table = table[table.count(axis=1) > 1]
+    table = table.loc[:, table.count() >= len(table) / 2].dropna()
     agreement = agreement_correlation(table.to_numpy())
     coefficient = NORMAL_95 * np.sqrt(2) * one_way.within
     change = np.array([x[1] - x[0] for x in repeated])

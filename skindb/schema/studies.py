@@ -509,7 +509,7 @@ ICC_HIGH = declare(
 )
 ICC_AGREEMENT = declare(
     "float64 repeatability/icc_agreement(quantity) [1]",
-    "ICC(2,1): icc of subjects with all visits and repeats, absolute agreement",
+    "ICC(2,1), absolute agreement, of subjects with all visits and repeats that half of them have",
     "McGraw and Wong 1996",
 )
 ICC_AGREEMENT_LOW = declare(

@@ -131,3 +131,18 @@ def test_repeatability__of_equal_values_is_unknown():
     constant = table.sel(quantity="R_d face R")
     assert np.isnan(constant["icc"])
     assert np.isnan(constant["repeatability_coefficient"])
+
+
+def test_repeatability__rare_visits_do_not_hide_the_agreement():
+    """Third visits of 4 of 12 subjects, none of whom has a fourth."""
+    cohort = planted(12, 4)
+    visit = np.tile(np.arange(4), 12)
+    person = np.repeat(np.arange(12), 4)
+    both = (visit == 0) | (visit == 1)
+    third = (visit == 2) & (person < 4)
+    fourth = (visit == 3) & (person == 11)
+    expected = repeatability(cohort.isel(take=both))
+    found = repeatability(cohort.isel(take=both | third | fourth))
+    name = "icc_agreement"
+    assert np.isfinite(found[name].sel(quantity="R_d face R"))
+    np.testing.assert_array_equal(found[name], expected[name])
