@@ -23,6 +23,7 @@ from skindb.analysis.formulas import (
     design_of,
     names_of,
     sum_of,
+    with_levels,
 )
 from skindb.analysis.long_form import INTERCEPT
 from skindb.analysis.study import Study, of_cohort, table_of
@@ -39,6 +40,9 @@ if TYPE_CHECKING:
 
 SIGNIFICANT = 0.05
 MAX_SUBJECTS = 10_000
+CERTAIN = (
+    1e4  # errors from 0 at which every power is reached; SciPy has none beyond 1e10
+)
 PARALLEL = "parallel"
 Design = Literal["parallel", "crossover"]
 COLUMNS = (
@@ -119,7 +123,7 @@ def sample_sizes(
         "must have (1 | subject), without slopes or nesting",
         "another random part",
     )
-    rows = _design(visits, design, doses)
+    rows = with_levels(model, _design(visits, design, doses))
     people = rows[SUBJECT].nunique()
     x, terms, _ = design_of(model, rows)
     require(
@@ -137,7 +141,7 @@ def sample_sizes(
     deviations = known[variables.MODEL_DEVIATION].sel(effect=[INTERCEPT, RESIDUAL])
     factors = sum_of(term, terms)
     step = people if design == PARALLEL else 1
-    counts = np.arange(people, MAX_SUBJECTS + 1, step)
+    counts = np.arange(step, MAX_SUBJECTS + 1, step)
     free = _degrees_of_freedom(x, rows, factors, counts)
     needed, errors = [], []
     for between, within in deviations.values:
@@ -164,7 +168,7 @@ def _design(visits: int, design: Design, doses: int) -> pd.DataFrame:
     pairs = itertools.product(range(doses + 1), repeat=2)
     arms = [pair for pair in pairs if design != PARALLEL or pair[0] == pair[1]]
     return pd.DataFrame(
-        [(*pair, float(visit + 1)) for pair in arms for visit in range(visits)],
+        [(*pair, visit + 1) for pair in arms for visit in range(visits)],
         columns=[SUBJECT, "treatment", "visit"],
     )
 
@@ -172,18 +176,22 @@ def _design(visits: int, design: Design, doses: int) -> pd.DataFrame:
 def _degrees_of_freedom(
     x: Array, rows: pd.DataFrame, factors: Array, counts: Index
 ) -> Array:
-    """Degrees of freedom, as in `linear_model`, with each number of subjects."""
+    """Degrees of freedom, as in `linear_model`, with each number of subjects; 0 with too few
+    for any term.
+    """
     is_between = is_constant_within(x, rows[SUBJECT].to_numpy())
     between = counts - is_between.sum()
     takes = len(rows) // rows[SUBJECT].nunique()
     within = counts * (takes - 1) - (~is_between).sum()
     free = np.where(is_between[:, None], between, within)
-    return np.asarray(free[factors != 0].min(axis=0), float)
+    is_determined = (free > 0).all(axis=0)
+    return np.where(is_determined, free[factors != 0].min(axis=0), 0).astype(float)
 
 
 def _power(distance: Array, free: Array) -> Array:
     """Power of two-sided t tests at 5 % of effects that are `distance` errors from 0."""
     is_possible = free > 0
+    distance = np.clip(distance, -CERTAIN, CERTAIN)
     limit = scipy.stats.t.ppf(1 - SIGNIFICANT / 2, np.where(is_possible, free, 1))
     of_sides = [
         scipy.stats.nct.sf(limit, np.where(is_possible, free, 1), side * distance)

@@ -90,6 +90,40 @@ def test_sample_sizes__of_doses_by_hand(cohort):
     assert (arms["plan_subjects"] % 3 == 0).all()
 
 
+def test_sample_sizes__of_factors_by_hand(cohort):
+    """The change from the first to the third visit differs between arms with the variance
+    8 s^2 / n: C(visit) has 3 n - n - 4 degrees of freedom within subjects.
+    """
+    plan = sample_sizes(
+        cohort,
+        formula="R_d ~ treatment * C(visit) + (1 | subject)",
+        term="treatment:visit[T.3]",
+        effect=0.01,
+        visits=3,
+    ).sel(quantity=NAME)
+    count = np.arange(4, 200, 2)
+    error = float(plan["residual_deviation"]) * np.sqrt(8 / count)
+    free = 2 * count - 4
+    power = stats.nct.sf(stats.t.ppf(0.975, free), free, 0.01 / error)
+    assert float(plan["plan_subjects"]) == count[np.flatnonzero(power >= 0.8)[0]]
+    with pytest.raises(InputError, match="multiples of Intercept, treatment.T.1."):
+        formula = "R_d ~ C(treatment) + (1 | subject)"
+        sample_sizes(cohort, formula=formula, term="treatment", effect=1)
+
+
+@pytest.mark.parametrize("effect", [1.0, 1e9])
+def test_sample_sizes__of_a_large_effect_are_the_fewest_of_the_model(cohort, effect):
+    plan = sample_sizes(
+        cohort,
+        formula="R_d ~ treatment + (1 | subject)",
+        term="treatment",
+        effect=effect,
+        design="crossover",
+        doses=8,
+    )
+    assert (plan["plan_subjects"] == 2).all()
+
+
 def test_sample_sizes__too_small_an_effect_has_no_number(cohort):
     plan = sample_sizes(cohort, formula=FORMULA, term="visit", effect=1e-7, visits=2)
     assert plan["plan_subjects"].isnull().all()
