@@ -147,15 +147,15 @@ def apply_traits(
 
 
 def _notes(traits: Dataset, amount: Array) -> list[str]:
-    """A line for each trait: its number of takes, or the warning of the study about it."""
+    """A line for each trait: its number of subjects, or the warning of the study about it."""
     flagged = {flag.partition(": ")[0]: flag for flag in traits.attrs.get("flags", [])}
     notes = []
     for i in np.flatnonzero(amount):
         name = str(traits["trait"].values[i])
         count, without = traits[variables.TRAIT_COUNT].values[i].tolist()
-        # for a numeric attribute, all takes are counted on one side
+        # for a numeric attribute, all subjects are counted on one side
         sides = f" with, {without} without" if without else ""
-        notes.append(flagged.get(name, f"{name}: {counted(count, 'take')}{sides}"))
+        notes.append(flagged.get(name, f"{name}: {counted(count, 'subject')}{sides}"))
     return notes
 
 

@@ -65,6 +65,7 @@ class Units:
     # takes whose mean is subtracted; empty where subjects are compared
     against: tuple[Mask, ...]
     design: Array  # (n, p) regressors; the coefficient of the first is the vector
+    count: tuple[int, int]  # subjects with and without the trait
 
     def values(self, of_takes: Array) -> Array:
         """Mean values (n, ...) of the units."""
@@ -111,8 +112,8 @@ def trait_vectors(
         `trait_histogram_shift`, `trait_quantile_shift`,
         `trait_log_sigma_tr_shift`, with `texture` also `trait_texture_shift`, and
         standard errors of all except histograms and texture by bootstrap over subjects
-        (NaN if a side has fewer than two); `trait_count` (side: with, without; for
-        numeric attributes all takes are "with"); `take_log_sigma_tr` (reference for the
+        (NaN if a side has fewer than two); `trait_count`, subjects (side: with, without;
+        for numeric attributes all are "with"); `take_log_sigma_tr` (reference for the
         distance of an edit). NaN where a side has no such region, or no probe site was
         measured on both sides. Attribute `flags`: traits with few subjects on a side,
         and those that are excluded because the attributes in `adjust` determine them.
@@ -142,8 +143,7 @@ def trait_vectors(
         shifts[name] = np.linalg.norm(shifts[name], axis=-1) / length
     if not units:
         flags.append("no attribute and no condition differs between the takes")
-    counts = np.array([[mask.sum() for mask in split[name]] for name in units])
-    counts = counts.reshape(len(units), len(SIDES))
+    counts = np.reshape([unit.count for unit in units.values()], (-1, len(SIDES)))
     part = {} if texture is None else {"part": texture["part"].values}
     return dataset(
         {
@@ -256,7 +256,7 @@ def _units(
         rows, rows_without = (
             tuple(mask & (who == s) for s in pairs) for mask in (carries, lacks)
         )
-        return Units(rows, rows_without, np.ones((len(pairs), 1)))
+        return Units(rows, rows_without, np.ones((len(pairs), 1)), (len(pairs),) * 2)
     others = sorted(set(who[lacks]) - set(pairs))
     names = [*pairs, *others]
     rows = tuple((carries if s in pairs else lacks) & (who == s) for s in names)
@@ -275,7 +275,8 @@ def _units(
         ", ".join(adjust) or "one value",
         "adjust for fewer attributes, or exclude the trait",
     )
-    return Units(tuple(itertools.compress(rows, complete)), (), design)
+    count = (int(complete[: len(pairs)].sum()), int(complete[len(pairs) :].sum()))
+    return Units(tuple(itertools.compress(rows, complete)), (), design, count)
 
 
 def _coefficients(values: Array, design: Array, drawn: Array) -> tuple[Array, Array]:
@@ -322,18 +323,18 @@ def _deviation(resampled: Array) -> Array:
 
 
 def _flags(names: Sequence[str], counts: Array) -> list[str]:
-    """Traits with few takes on a side; all takes of a numeric attribute are on one side."""
+    """Traits with few subjects on a side; all of a numeric attribute are on one side."""
     flags = []
     for name, (carries, lacks) in zip(names, counts.tolist(), strict=True):
         smallest = min(carries, lacks) if lacks else carries
         if smallest == 1:
             flags.append(
-                f"{name}: only one take {SIDES[carries > 1]} it, so that the "
+                f"{name}: only one subject {SIDES[carries > 1]} it, so that the "
                 "vector contains an individual"
             )
         elif smallest < FEW:
-            among = f"{carries} takes with and {lacks} without"
-            among = among if lacks else f"{carries} takes"
+            among = f"{carries} subjects with and {lacks} without"
+            among = among if lacks else f"{carries} subjects"
             flags.append(f"{name}: {among}; the vector contains individual differences")
     return flags
 
@@ -364,12 +365,12 @@ def plot_traits(traits: Dataset, *, ax: Axes | None = None) -> Axes:
 
 
 def tabulate_traits(traits: Dataset) -> Table:
-    """Header and one row per trait: numbers of takes, the distance of BRDFs, RMS lengths
+    """Header and one row per trait: numbers of subjects, the distance of BRDFs, RMS lengths
     of the other parts of its vector, and their errors.
     """
     face = traits.sel(region=FACE, drop=True)
     columns = {
-        f"takes_{side}": traits[variables.TRAIT_COUNT].sel(side=side, drop=True)
+        f"subjects_{side}": traits[variables.TRAIT_COUNT].sel(side=side, drop=True)
         for side in SIDES
     }
     for name, variable in (

@@ -700,7 +700,7 @@ GROUP_DISTANCE_P_ADJUSTED = declare(
 # traits
 TRAIT_COUNT = declare(
     "int32 traits/trait_count(trait, side) [1]",
-    "takes with and without the trait",
+    "subjects with and without the trait",
 )
 TRAIT_BRDF_SHIFT = declare(
     "float64 traits/trait_brdf_shift(trait, component) [1]",

@@ -52,6 +52,28 @@ def test_trait_vectors__a_number_has_the_vector_of_one_unit():
     assert found["trait_count"].values.tolist() == [40, 0]
 
 
+def test_trait_vectors__visits_of_a_subject_count_once():
+    """One man at two visits, and a woman whose age is unknown."""
+    subjects = ["S0", "S0", "S1", "S1", "S2", "S3"]
+    age = [30.0, 31.0, 40.0, 41.0, 50.0, np.nan]
+    gender = ["male"] * 2 + ["female"] * 4
+    cohort = planted_tables(subjects, gender=gender, age=age)
+    for adjust, women in (([], 3), (["age"], 2)):
+        found = _vectors(cohort, adjust=adjust)
+        count = found["trait_count"].to_pandas().T
+        assert count["gender:male"].tolist() == [1, women]
+        assert adjust or count["age"].tolist() == [3, 0]
+        assert (
+            "gender:male: only one subject with it, so that the vector contains an individual"
+            in found.attrs["flags"]
+        )
+    lotion = ["normal", "lotion"] * 2 + ["lotion"] * 2
+    paired = _vectors(
+        planted_tables(["S0", "S0", "S1", "S1", "S1", "S2"], conditions=lotion)
+    )
+    assert paired["trait_count"].values.tolist() == [[2, 2]]
+
+
 def test_trait_vectors__adjusted_ones_leave_out_what_goes_with_another_attribute():
     rng = np.random.default_rng(2)
     age = rng.uniform(20, 60, 60)
@@ -139,7 +161,7 @@ def test_trait_vectors__of_one_subject_have_no_error_and_say_so():
     male = found.sel(trait="gender:male")
     assert np.isfinite(male["trait_brdf_shift"]).all()
     assert (
-        "gender:male: only one take with it, so that the vector contains an individual"
+        "gender:male: only one subject with it, so that the vector contains an individual"
         in found.attrs["flags"]
     )
     assert np.isnan(found.sel(trait="gender:male")["trait_brdf_shift_error"]).all()

@@ -93,7 +93,7 @@ def test_trait_vectors__takes_go_by_name():
 def test_trait_vectors__single_takes_are_flagged():
     traits = analysed(population())[2]
     assert (
-        "condition:lotion: only one take with it, so that the vector contains an individual"
+        "condition:lotion: only one subject with it, so that the vector contains an individual"
         in traits.attrs["flags"]
     )
     assert not any(
