@@ -169,6 +169,17 @@ def _subject_faces(cohort: Dataset, adjust: Sequence[str]) -> Faces:
     terms, design = _design(subjects, adjust)
     complete = finite_rows(design)
     chosen = [*itertools.compress(subjects.names, complete)]
+    skipped += [
+        note(name, f"lacks {' or '.join(adjust)}")
+        for name in itertools.compress(subjects.names, ~complete)
+    ]
+    require(
+        chosen,
+        "face model",
+        f"subjects must have {' and '.join(adjust)}",
+        "none",
+        "adjust for fewer attributes",
+    )
     faces = np.stack([faces[subjects.rows_of(name)].mean(axis=0) for name in chosen])
     quantities = vectors["quantity"].values.tolist()
     return Faces(faces, quantities, used, chosen, terms, design[complete], skipped)
@@ -236,8 +247,16 @@ def _design(subjects: Subjects, adjust: Sequence[str]) -> tuple[list[str], Array
     terms = []
     columns: list[Array] = [np.empty((len(subjects.names), 0))]
     for name in adjust:
+        subjects.require_constant(name)
         attribute = subjects.by_subject(name, subjects.names)
         attribute.require_one_kind()
+        require(
+            len(attribute.words) > 1,
+            f"adjust {name}",
+            "must differ between subjects",
+            ", ".join(attribute.words) or "no value",
+            "omit it",
+        )
         if attribute.is_numeric:
             terms.append(name)
             columns.append(attribute.numbers[:, None])
@@ -463,9 +482,7 @@ def condition_face_model(
         variables.FACE_MEAN: (DIMS, mean),
         variables.FACE_MODE: (("mode", *DIMS), remaining),
     }
-    conditional = model.drop_dims("term", errors="ignore").assign(maps)
-    return conditional.assign_attrs(
-        distance=float(np.linalg.norm(scores)),
-        log_density=float(density),
-        p=(1 + int(lower.sum())) / (1 + len(lower)),
-    )
+    attrs = {"distance": float(np.linalg.norm(scores)), "log_density": float(density)}
+    if (is_known == np.isfinite(expected)).all():
+        attrs["p"] = (1 + int(lower.sum())) / (1 + len(lower))
+    return model.drop_dims("term", errors="ignore").assign(maps).assign_attrs(attrs)

@@ -128,6 +128,9 @@ def trait_vectors(
     subjects = subjects_of(cohort)
     split = _split_takes(subjects)
     require_adjustable(subjects, adjust)
+    for name in adjust:
+        subjects.require_constant(name)
+        subjects.attribute(name).require_one_kind()
     units = {}
     flags = []
     for name, (carries, lacks) in split.items():

@@ -274,6 +274,45 @@ def test_distances__follow_their_law():
     assert stats.kstest(p, "uniform").statistic < limit
 
 
+def test_condition__parts_of_faces_have_no_p(model):
+    """Their densities are of fewer entries than those of the subjects."""
+    face = as_maps(faces_of([[0, 0]], [40])[0])
+    assert "p" in condition_face_model(model, face).attrs
+    part = condition_face_model(model, face[["texel_diffuse_reflectance"]]).attrs
+    assert "p" not in part
+    assert part["log_density"] != 0
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        (["a", "b"] * 6, "must be the same in all takes of a subject"),
+        (["a"] * 12, "must differ between subjects; found a"),
+        ([""] * 12, "must differ between subjects; found no value"),
+    ],
+)
+def test_face_model__refuses_attributes_that_it_would_ignore(values, said):
+    subject = [f"S{i // 2}" for i in range(12)]
+    faces = faces_of(np.eye(12, MODES), [40] * 12)
+    cohort = cohort_of(faces, subject=subject, side=values)
+    with pytest.raises(InputError, match=said):
+        face_model(cohort, adjust=["side"], rng=np.random.default_rng(0))
+
+
+def test_face_model__names_subjects_without_an_attribute():
+    ages = [np.nan, *range(30, 39)]
+    faces = faces_of(np.random.default_rng(0).normal(size=(10, MODES)), [40] * 10)
+    model = face_model(
+        cohort_of(faces, age=ages), adjust=["age"], rng=np.random.default_rng(0)
+    )
+    assert model.sizes["subject"] == 9
+    assert model.attrs["skipped"] == [{"take": "T0", "reason": "lacks age"}]
+    height = [1.7, 1.8, *[np.nan] * 8]
+    cohort = cohort_of(faces, age=[np.nan] * 2 + ages[:-2], height=height)
+    with pytest.raises(InputError, match="must have age and height; found none"):
+        face_model(cohort, adjust=["age", "height"], rng=np.random.default_rng(0))
+
+
 def test_reconstruction_error__equals_that_of_a_loop():
     """Regression and modes of the others by a singular value decomposition."""
     cohort, _ = population(n=9, seed=2)

@@ -74,6 +74,15 @@ def test_trait_vectors__visits_of_a_subject_count_once():
     assert paired["trait_count"].values.tolist() == [[2, 2]]
 
 
+def test_trait_vectors__refuses_adjustments_for_words_that_differ_within_subjects():
+    cohort = planted_tables(["S0", "S0", "S1"], side=["a", "b", "a"])
+    with pytest.raises(InputError, match="same in all takes of a subject; found a, b"):
+        _vectors(cohort, adjust=["side"])
+    cohort = planted_tables(["S0", "S1", "S2"], age=["30", "old", "40"])
+    with pytest.raises(InputError, match="found numbers and 'old'"):
+        _vectors(cohort, adjust=["age"])
+
+
 def test_trait_vectors__adjusted_ones_leave_out_what_goes_with_another_attribute():
     rng = np.random.default_rng(2)
     age = rng.uniform(20, 60, 60)
