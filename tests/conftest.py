@@ -26,7 +26,7 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 
 # files of more than a minute
 LONGEST = {
-    "test_killed_runs",
+    "test_destructive",
     "test_rig",
     "test_takes",
     "test_viewer_page",
