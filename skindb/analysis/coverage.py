@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
@@ -124,7 +125,8 @@ def _factors(
         if name == AGE:
             factors[AGE_BAND] = _age_bands(attribute.numbers)
         elif not attribute.is_numeric and 1 <= len(attribute.words) <= MAX_VALUES:
-            factors[name] = _indicators(attribute.values)
+            factor = f"attribute {name}" if name in (AGE_BAND, SITE) else name
+            factors[factor] = _indicators(attribute.values)
     conditions = _indicators(takes.attribute(CONDITION).values)
     factors[CONDITION] = {
         name: np.isin(names, who[rows]) for name, rows in conditions.items()
@@ -247,7 +249,10 @@ def plot_coverage(report: Dataset, *, ax: Axes | None = None) -> Axes:
     """
     from matplotlib.colors import LogNorm
 
-    cells = [tuple(name.split(AND)) for name in report["cell"].values]
+    # values may contain AND
+    factors = "|".join([*CROSSED, CONDITION, SITE])
+    between = re.compile(f"{AND}(?=(?:{factors}): )")
+    cells = [tuple(between.split(name)) for name in report["cell"].values]
     numbers = report[variables.COVERAGE_COUNT].values.tolist()
     count_of = dict(zip(map(frozenset, cells), numbers, strict=True))
     bands: list[Words] = [
@@ -257,7 +262,7 @@ def plot_coverage(report: Dataset, *, ax: Axes | None = None) -> Axes:
     rows = [
         cell
         for cell in cells
-        if AGE_BAND not in str(cell)
+        if not any(part.startswith(f"{AGE_BAND}: ") for part in cell)
         and all(frozenset(cell + column) in count_of for column in columns)
     ]
     counts = np.array(

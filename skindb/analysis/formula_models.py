@@ -25,7 +25,7 @@ from skindb.analysis.formulas import (
     with_levels,
 )
 from skindb.analysis.long_form import COLUMNS as VALUES
-from skindb.analysis.long_form import INTERCEPT, tidy
+from skindb.analysis.long_form import INTERCEPT, KEYS, tidy
 from skindb.analysis.quantities import QUANTITIES, quantities_of
 from skindb.analysis.study import Study, Table, of_cohort, skipped_takes, table_of
 from skindb.analysis.subjects import CONDITION, NORMAL, Subjects
@@ -125,7 +125,7 @@ def linear_model(
     known = [name for name in frame.columns if name not in unused]
     used = names_of(model, known)
     frame = frame[frame["quantity"] == model.quantity]
-    doses = sorted({*used} & {*frame[CONDITION]})
+    doses = sorted(({*used} & {*frame[CONDITION]}) - {*KEYS, BASELINE})
     is_normal = frame[CONDITION] == NORMAL
     for name in doses:
         frame[name] = frame[name].where(frame[name].notna() | ~is_normal, 0.0)

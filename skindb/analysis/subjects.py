@@ -338,7 +338,14 @@ def attribute_of(subjects: Subjects, name: str) -> str:
     """The attribute to which a trait belongs; the name itself if it is an attribute."""
     if name in subjects.attributes:
         return name
-    return trait_of(subjects, name).partition(":")[0]
+    return parts_of(subjects, trait_of(subjects, name))[0]
+
+
+def parts_of(subjects: Subjects, trait: str) -> tuple[str, str]:
+    """Attribute and value of a trait; names of attributes may contain colons."""
+    names = [name for name in subjects.attributes if f"{trait}:".startswith(f"{name}:")]
+    attribute = max(names, key=len, default=trait)
+    return attribute, trait[len(attribute) + 1 :]
 
 
 def trait_of(subjects: Subjects, name: str) -> str:
@@ -417,19 +424,20 @@ def sides(subjects: Subjects, trait: str) -> tuple[Mask, Mask]:
 
 def has_trait(subjects: Subjects, trait: str) -> Mask:
     """Mask (take,) of the takes that have a trait, given by its full name."""
-    name, _, value = trait.partition(":")
+    name, value = parts_of(subjects, trait)
     if trait == OLDER:
         ages = subjects.by_subject(AGE, subjects.names).numbers
         known = ages[np.isfinite(ages)]
         median = np.median(known) if known.size else np.inf
-        return subjects.attribute(AGE).numbers > median
+        # that of the subject: visits at other ages are not on both sides
+        return subjects.by_subject(AGE, subjects.subject).numbers > median
     values = subjects.attribute(name).values
     return np.array([v == value if value else v is True for v in values], bool)
 
 
 def has_attribute(subjects: Subjects, trait: str) -> Mask:
     """Mask (take,) of the takes that have the attribute of a trait."""
-    attribute = subjects.attribute(trait.partition(":")[0])
+    attribute = subjects.attribute(parts_of(subjects, trait)[0])
     if trait == OLDER:
         return np.isfinite(attribute.numbers)
     return np.array([value is not None for value in attribute.values], bool)

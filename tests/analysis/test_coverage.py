@@ -140,6 +140,22 @@ def test_coverage_report__refuses_an_empty_cohort():
         coverage_report(cohort_of([]))
 
 
+def test_plot_coverage__values_may_look_like_crossings_and_factors():
+    subjects = [f"S{i}" for i in range(4)]
+    words = ["a x b", "a x b", "age band: x", "c"]
+    ages = [20, 30, 40, 50]
+    report = coverage_report(
+        cohort_of(subjects, gender=words, age=ages, **{"age band": ["y"] * 4})
+    )
+    counts = counts_of(report)
+    assert counts["age band: 20-29"] == 1
+    assert counts["attribute age band: y"] == 4
+    ax = plot_coverage(report)
+    labels = {text.get_text() for text in ax.get_yticklabels()}
+    assert labels == {f"gender: {word}" for word in words} | {"condition: normal"}
+    mpl.pyplot.close(ax.figure)
+
+
 def test_plot_coverage__shows_the_counts(population):
     ax = plot_coverage(coverage_report(population))
     labels = [text.get_text() for text in ax.get_yticklabels()]

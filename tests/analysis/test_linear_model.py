@@ -619,6 +619,20 @@ def test_linear_model__reliability_by_hand(error):
     assert (flag in found.attrs["flags"]) == (within < 0.5)
 
 
+@pytest.mark.parametrize("condition", ["subject", "visit", "baseline"])
+def test_linear_model__conditions_that_are_called_like_columns_are_no_doses(condition):
+    cohort = planted()
+    conditions = np.where(np.arange(96) % 4 == 3, condition, "normal")
+    cohort = cohort.assign_coords(condition=("take", conditions))
+    formula = f"R_d ~ {condition} + (1 | subject)"
+    if condition == "subject":
+        formula = FORMULA
+    fitted = linear_model(cohort, formula=formula)
+    assert fitted.attrs["condition"] == "normal"
+    count = 48 if condition == "baseline" else 72
+    assert (fitted["model_takes"] == count).all()
+
+
 def test_linear_model__of_conditions_contains_even_reflection():
     """The errors of two priors, 1.96 hypot(0.01, 0.012), and R_d that rises by 0.02."""
     names = [f"S{i:02d}" for i in range(20)]

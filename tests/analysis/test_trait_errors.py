@@ -74,6 +74,26 @@ def test_trait_vectors__visits_of_a_subject_count_once():
     assert paired["trait_count"].values.tolist() == [[2, 2]]
 
 
+def test_trait_vectors__names_of_attributes_may_contain_colons():
+    hair = ["fair", "fair", "dark"]
+    cohort = planted_tables(
+        _people(3), **{"hair:colour": hair, "a:b": [True] * 2 + [False]}
+    )
+    found = _vectors(cohort)
+    counts = dict(
+        zip(found["trait"].values, found["trait_count"].values.tolist(), strict=True)
+    )
+    fair, dark = [2, 1], [1, 2]
+    assert counts == {"a:b": fair, "hair:colour:dark": dark, "hair:colour:fair": fair}
+
+
+def test_trait_vectors__a_subject_is_older_at_all_visits_or_at_none():
+    subjects = ["S0", "S1", "S1", "S2", "S3", "S4"]
+    cohort = planted_tables(subjects, age=[20.0, 38, 42, 39.0, 50.0, 60.0])
+    found = _vectors(cohort)["trait_count"].sel(trait="age:older")
+    assert found.values.tolist() == [2, 3]
+
+
 def test_trait_vectors__refuses_adjustments_for_words_that_differ_within_subjects():
     cohort = planted_tables(["S0", "S0", "S1"], side=["a", "b", "a"])
     with pytest.raises(InputError, match="same in all takes of a subject; found a, b"):
