@@ -529,7 +529,10 @@ STUDY = Study(
     shown=("basis_size",),
     tabulate=tabulate_basis_size,
     plot=lambda curve: plot_basis_size({"these takes": curve}),
-    describe=lambda curve: [describe_basis_size(curve)],
+    describe=lambda curve: [
+        describe_basis_size(curve),
+        "intervals are of surfels of these takes, not of other people",
+    ],
     # the labels of the weights name the BRDFs of the fits
     cohort_options={
         "surfels": MAX_FACTORED,
