@@ -57,13 +57,22 @@ def new_axes(width: float, height: float) -> Axes:
     return ax
 
 
-def axes_of_rows(names: Sequence[str], ax: Axes | None) -> tuple[Axes, Array]:
-    """Axes with a row for each name, by default new ones, and the places (n,) of the rows."""
-    ax = ax or new_axes(6.5, 1.2 + 0.22 * len(names))
+def axes_of_rows(
+    names: Sequence[str], ax: Axes | None, *, lines: int = 1
+) -> tuple[Axes, Array]:
+    """Axes with a row of so many lines for each name, by default new ones, and the places
+    (n,) of the rows.
+    """
+    ax = ax or new_axes(6.5, 1.2 + max(0.22, 0.11 * lines) * len(names))
     places = np.arange(float(len(names)))[::-1]
     ax.set_yticks(places, [*map(typeset, names)], fontsize=7, parse_math=True)
     ax.set_ylim(-0.6, len(names) - 0.4)
     return ax, places
+
+
+def legend_entry(text: str) -> str:
+    """Text of a legend: without the space, Matplotlib would omit "_a"."""
+    return f" {text}" if text.startswith("_") else text
 
 
 def legend_above(ax: Axes, *, fontsize: float = 7) -> None:

@@ -289,7 +289,8 @@ def plot_albedo(
     # bins that are joined for the plot; the full number is needed only for matching
     width = 8
     centres = edges[:-1].reshape(-1, width).mean(axis=1)
-    if table is not None and table.attrs["group_by"]:
+    is_grouped = table is not None and bool(table.attrs["group_by"])
+    if table is not None and is_grouped:
         part = table.sel(region=FACE)
         counts = part[variables.GROUP_ALBEDO_COUNT].max("channel").values
         groups = zip(part["group"].values.tolist(), counts.tolist(), strict=True)
@@ -303,14 +304,18 @@ def plot_albedo(
     for i, (name, fractions) in enumerate(zip(names, lines, strict=True)):
         style: dict[str, Any] = {"color": "0.4", "linewidth": 0.5}
         if has_legend:
-            style = {"label": name, "color": plots.CYCLE[i % len(plots.CYCLE)]}
+            style = {
+                "label": plots.legend_entry(name),
+                "color": plots.CYCLE[i % len(plots.CYCLE)],
+            }
         joined = fractions.reshape(-1, width).sum(axis=1)
         linestyle = LINES[i // len(plots.CYCLE) % len(LINES)]
         ax.plot(centres, joined, linestyle=linestyle, **style)
     if has_legend:
         plots.legend_beside(ax)
     else:
-        ax.set_title(counted(len(names), "take"), fontsize=8)
+        kind = "group" if is_grouped else "take"
+        ax.set_title(counted(len(names), kind), fontsize=8)
     ax.set_xlabel("decorrelated colour, axis 0 [standard deviations]")
     ax.set_ylabel("fraction of the area")
     ax.set_ylim(bottom=0)

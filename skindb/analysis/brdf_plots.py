@@ -54,7 +54,7 @@ def plot_brdf_space(space: Dataset, *, ax: Axes | None = None) -> Axes:
             color=_colour(i),
             markersize=4,
             alpha=0.75,
-            label=f"{group} (n = {count}{takes})",
+            label=plots.legend_entry(f"{group} (n = {count}{takes})"),
         )
     horizontal, second = (
         f"{fraction:.1%}" for fraction in space[variables.EXPLAINED_FRACTION].values
@@ -138,7 +138,8 @@ def plot_group_lobes(space: Dataset, *, ax: PolarAxes | None = None) -> PolarAxe
     for incidence, line in zip(INCIDENCES, LINES, strict=True):
         for i, (group, count) in enumerate(_groups(space)):
             values = lobe(tables[..., [i]], np.radians(incidence), angle)[:, 0]
-            label = f"{group} (n = {count}), {incidence:.0f}°"
+            text = f"{group} (n = {count}), {incidence:.0f}°"
+            label = plots.legend_entry(text)
             ax.plot(angle, values, line, color=_colour(i), linewidth=1.2, label=label)
     ax.set_theta_zero_location("N")
     ax.set_theta_direction(-1)

@@ -208,13 +208,13 @@ def plot_correlations(table: Dataset, *, ax: Axes | None = None) -> Axes:
     significant = table[variables.CORRELATION_P_FALSE_DISCOVERY].values < 0.05
     colour = plots.CYCLE[0]
     plots.significant_intervals(ax, table, name, place, significant, colour=colour)
-    ax.set_xlim(-1, 1)
+    ax.set_xlim(-1.03, 1.03)
     count = int(table[variables.CORRELATION_COUNT].max())
     has_intervals = table[variables.COMPONENT_CORRELATION_LOW].notnull().any()
     interval = ", 95 % CI" if has_intervals else ""
     ax.set_xlabel(
         f"correlation between subjects{interval} (n = {count})\nfilled: p < 0.05 "
-        "at a false discovery rate of 5 %"
+        "at a false discovery rate of 5 %; channels of one component are not tested"
     )
     return ax
 

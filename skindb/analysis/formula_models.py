@@ -589,13 +589,15 @@ def plot_model(table: Dataset, *, ax: Axes | None = None) -> Axes:
     """
     terms = [term for term in table["term"].values.tolist() if term != INTERCEPT]
     names = table["quantity"].values.tolist()
-    ax, places = plots.axes_of_rows(names, ax)
+    ax, places = plots.axes_of_rows(names, ax, lines=len(terms))
     ax.axvline(0, color="0.6", linewidth=1)
     error = table[variables.MODEL_ERROR]
     shown = table[list(COLUMNS[:4])] / error
     for i, term in enumerate(terms):
         colour = plots.CYCLE[i % len(plots.CYCLE)]
-        ax.plot([], [], "o", color=colour, markersize=4, label=term)
+        marker = plots.MARKERS[i // len(plots.CYCLE) % len(plots.MARKERS)]
+        label = plots.legend_entry(term)
+        ax.plot([], [], marker, color=colour, markersize=4, label=label)
         plots.significant_intervals(
             ax,
             shown.sel(term=term, drop=True),
@@ -603,6 +605,7 @@ def plot_model(table: Dataset, *, ax: Axes | None = None) -> Axes:
             places - 0.6 * ((i + 0.5) / len(terms) - 0.5),
             table[variables.MODEL_P].sel(term=term).values < 0.05,
             colour=colour,
+            marker=marker,
         )
     counts = sorted({*table[variables.MODEL_SUBJECTS].values.tolist()})
     n = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))

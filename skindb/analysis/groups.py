@@ -368,9 +368,9 @@ def plot_group_effects(table: Dataset, *, ax: Axes | None = None) -> Axes:
     within one subject in per cent, one row per quantity.
     """
     names = table["quantity"].values.tolist()
-    ax, places = plots.axes_of_rows(names, ax)
-    ax.axvline(0, color="0.6", linewidth=1)
     contrasts = table["contrast"].values.tolist()
+    ax, places = plots.axes_of_rows(names, ax, lines=len(contrasts))
+    ax.axvline(0, color="0.6", linewidth=1)
     is_standardised = bool(table[variables.EFFECT_STANDARDISED].notnull().any())
     unit = "standard deviations between subjects" if is_standardised else "%"
     for i, contrast in enumerate(contrasts):
@@ -387,13 +387,13 @@ def plot_group_effects(table: Dataset, *, ax: Axes | None = None) -> Axes:
         colour = plots.CYCLE[i % len(plots.CYCLE)]
         marker = "osD^v"[i % 5]
         count = int(part[variables.EFFECT_COUNT].sum("side").max())
-        label = f"{contrast} (n = {count})"
+        label = plots.legend_entry(f"{contrast} (n = {count})")
         ax.plot([], [], marker, color=colour, markersize=4, label=label)
         plots.significant_intervals(
             ax,
             shown,
             variables.EFFECT,
-            places + 0.6 * ((i + 0.5) / len(contrasts) - 0.5),
+            places - 0.6 * ((i + 0.5) / len(contrasts) - 0.5),
             part[variables.EFFECT_P_ADJUSTED].values < SIGNIFICANT,
             colour=colour,
             marker=marker,

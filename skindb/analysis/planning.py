@@ -217,8 +217,17 @@ def plot_plan(table: Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot the number of subjects for each quantity."""
     names = table["quantity"].values.tolist()
     ax, places = plots.axes_of_rows(names, ax)
-    ax.plot(table[variables.PLAN_SUBJECTS], places, "o", color=plots.BLUE)
-    ax.set_xlim(left=0)
+    subjects = table[variables.PLAN_SUBJECTS].values
+    ax.plot(subjects, places, "o", color=plots.BLUE)
+    ax.set_xlim(0, 1.05 * np.nanmax(subjects, initial=1.0))
+    for place in places[np.isnan(subjects)]:
+        ax.annotate(
+            f"more than {MAX_SUBJECTS:,}",
+            (0.02, place),
+            xycoords=("axes fraction", "data"),
+            fontsize=7,
+            va="center",
+        )
     ax.set_xlabel(
         f"subjects for a power of {100 * table.attrs['power']:g} %\n"
         f"{table.attrs['term']} = {table.attrs['effect']:g}"

@@ -430,7 +430,8 @@ def has_trait(subjects: Subjects, trait: str) -> Mask:
         known = ages[np.isfinite(ages)]
         median = np.median(known) if known.size else np.inf
         # that of the subject: visits at other ages are not on both sides
-        return subjects.by_subject(AGE, subjects.subject).numbers > median
+        ages = subjects.by_subject(AGE, subjects.subject).numbers
+        return has_attribute(subjects, trait) & (ages > median)
     values = subjects.attribute(name).values
     return np.array([v == value if value else v is True for v in values], bool)
 

@@ -351,8 +351,8 @@ def plot_traits(traits: Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot the shift of the coefficients of the surface BRDF: rows are traits, columns
     are components of the basis.
     """
-    ax = ax or plots.new_axes(6, 3.6)
     shift = traits[variables.TRAIT_BRDF_SHIFT].values
+    ax = ax or plots.new_axes(6, 1.2 + 0.22 * max(len(shift), 8))
     largest = max(float(np.abs(shift).max(initial=0.0)), 1e-12)
     image = ax.imshow(shift, cmap="RdBu_r", vmin=-largest, vmax=largest, aspect="auto")
     counts = [
@@ -361,8 +361,12 @@ def plot_traits(traits: Dataset, *, ax: Axes | None = None) -> Axes:
             traits["trait"].values, traits[variables.TRAIT_COUNT].values, strict=True
         )
     ]
-    ax.set_yticks(range(len(counts)), counts)
-    ax.set_xlabel("component of the common basis")
+    ax.set_yticks(range(len(counts)), counts, fontsize=7)
+    components = np.arange(shift.shape[1])
+    ax.set_xticks(components, components + 1)
+    ax.set_xlabel("component of the common basis (subjects with/without)")
+    if not counts:
+        ax.set_title("no attribute and no condition differs", fontsize=8)
     ax.figure.colorbar(image, ax=ax, label="coefficient with minus without")
     return ax
 

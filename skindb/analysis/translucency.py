@@ -161,25 +161,29 @@ def plot_translucency(table: Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot mean sigma_tr with its 95 % interval per site; colours are channels, markers
     are groups.
     """
-    ax = ax or plots.new_axes(6, 3.6)
     sites = table["site"].values.tolist()
-    for g, group in enumerate(map(str, table["group"].values)):
+    groups = [*map(str, table["group"].values)]
+    lines = len(groups) * len(plots.CHANNELS)
+    ax = ax or plots.new_axes(max(6, 1 + 0.12 * lines * len(sites)), 3.6)
+    for g, group in enumerate(groups):
         for c, colour in enumerate(plots.CHANNELS):
             part = table.isel(group=g, channel=c)
             count = int(part[variables.SIGMA_TR_COUNT].max())
-            of_group = f", {group}" if table.sizes["group"] > 1 else ""
+            of_group = f", {group}" if len(groups) > 1 else ""
+            line = c * len(groups) + g
             plots.intervals(
                 ax,
                 part,
                 variables.SIGMA_TR_MEAN,
-                np.arange(len(sites)) + 0.12 * (c - 1) + 0.03 * g,
+                np.arange(len(sites)) + 0.7 * ((line + 0.5) / lines - 0.5),
                 vertical=True,
                 fmt="os^Dv"[g % 5],
                 color=colour,
                 label=f"{table['channel'].values[c]}{of_group} (n = {count})",
             )
     ax.set_xticks(range(len(sites)), sites)
-    ax.set_ylim(bottom=0)
+    ax.set_xlim(-0.5, len(sites) - 0.5)
+    ax.set_ylim(0, 1.05 * ax.get_ylim()[1])
     label = plots.typeset("mean sigma_tr with 95 % CI [mm-1]")
     ax.set_ylabel(label, parse_math=True)
     plots.legend_beside(ax)

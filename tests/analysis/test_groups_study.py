@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from matplotlib import pyplot as plt
 from planted_tables import planted_tables
 from scipy import stats
 
@@ -373,6 +374,18 @@ def test_plot_group_effects__has_a_row_for_each_quantity(tmp_path):
     assert len(ax.get_yticklabels()) == table.sizes["quantity"]
     assert "(n = 50)" in ax.get_legend().get_texts()[0].get_text()
     ax.figure.savefig(tmp_path / "a.png", dpi=100, bbox_inches="tight")
+
+
+def test_plot_group_effects__of_many_groups_has_room_and_names_all():
+    """A group whose name begins with an underscore is in the legend too."""
+    words = ["_a", *"bcdefghijkl"]
+    cohort = planted_tables(_people(36), word=np.tile(words, 3))
+    ax = plot_group_effects(_compare(cohort, "word", permutations=100))
+    texts = [text.get_text().strip() for text in ax.get_legend().get_texts()]
+    assert texts == [f"{word} less others (n = 36)" for word in words]
+    inches = ax.figure.get_figheight() / len(ax.get_yticklabels())
+    assert inches > 0.1 * len(words)
+    plt.close(ax.figure)
 
 
 def _repeated(stated: float, repeat: float, between: float = 0.002):

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from matplotlib import pyplot
 from scipy import stats
 from statsmodels.stats.power import TTestIndPower, TTestPower
 from test_linear_model import planted
 
 from skindb.analysis import linear_model, sample_sizes
+from skindb.analysis.planning import plot_plan
 from skindb.errors import InputError
 
 FORMULA = "R_d ~ treatment * visit + (1 | subject)"
@@ -106,8 +108,8 @@ def test_sample_sizes__of_factors_by_hand(cohort):
     free = 2 * count - 4
     power = stats.nct.sf(stats.t.ppf(0.975, free), free, 0.01 / error)
     assert float(plan["plan_subjects"]) == count[np.flatnonzero(power >= 0.8)[0]]
-    with pytest.raises(InputError, match="multiples of Intercept, treatment.T.1."):
-        formula = "R_d ~ C(treatment) + (1 | subject)"
+    formula = "R_d ~ C(treatment) + (1 | subject)"
+    with pytest.raises(InputError, match=r"multiples of Intercept, treatment.T.1."):
         sample_sizes(cohort, formula=formula, term="treatment", effect=1)
 
 
@@ -127,6 +129,10 @@ def test_sample_sizes__of_a_large_effect_are_the_fewest_of_the_model(cohort, eff
 def test_sample_sizes__too_small_an_effect_has_no_number(cohort):
     plan = sample_sizes(cohort, formula=FORMULA, term="visit", effect=1e-7, visits=2)
     assert plan["plan_subjects"].isnull().all()
+    ax = plot_plan(plan)
+    texts = [text.get_text() for text in ax.texts]
+    assert texts == ["more than 10,000"] * plan.sizes["quantity"]
+    pyplot.close(ax.figure)
 
 
 @pytest.mark.parametrize(

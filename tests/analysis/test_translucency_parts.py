@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from matplotlib import pyplot
 from planted_tables import planted_tables
 
-from skindb.analysis import translucency_table
+from skindb.analysis import plot_translucency, translucency_table
 from skindb.errors import InputError
 
 
@@ -64,3 +65,15 @@ def test_translucency_table__needs_a_probe():
     cohort = _cohort(3, 1, people=0.2, repeat=0.0, noise=0.1, seed=1)
     with pytest.raises(InputError, match="must have sites of the probe"):
         translucency_table(cohort.drop_dims("site"))
+
+
+def test_plot_translucency__points_of_groups_do_not_coincide_and_are_not_cut():
+    word = [f"{i // 2:02d} a" for i in range(24)]
+    table = translucency_table(planted_tables(range(24), word=word), group_by="word")
+    ax = plot_translucency(table)
+    places = [line.lines[0].get_xdata().item() for line in ax.containers]
+    assert np.diff(np.sort(places)).min() > 0.01
+    assert max(map(abs, places)) < 0.5
+    highest = np.nanmax(table["sigma_tr_mean_high"])
+    assert ax.get_ylim()[1] > 1.02 * highest
+    pyplot.close(ax.figure)
