@@ -207,11 +207,13 @@ def test_writer__of_another_subject_is_never_disturbed(made, tmp_path):
     ("writer", "first"), [("capture", 0), ("study", 1), ("release", 2), ("cache", 0)]
 )
 def test_writer__suspended_at_every_third_step_of_a_bucket_leaves_nothing(
-    bucket, new_database, writer, first
+    made, new_database, writer, first
 ):
+    filled = contents(made)
     for number in range(first, 1000, 3):
         db = Database(new_database("localbucket"))
-        _fill(db.url)
+        for key, content in filled.items():
+            db.place.replace(key, content)
         steps = Steps(number, partial(_withdraw, db))
         with pytest.MonkeyPatch.context() as patch:
             steps.watch(patch, BUCKET_STEPS)
