@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -125,7 +125,7 @@ def linear_model(
     known = [name for name in frame.columns if name not in unused]
     used = names_of(model, known)
     frame = frame[frame["quantity"] == model.quantity]
-    doses = sorted(({*used} & {*frame[CONDITION]}) - {*KEYS, BASELINE})
+    doses = _doses(used, frame[CONDITION])
     is_normal = frame[CONDITION] == NORMAL
     for name in doses:
         frame[name] = frame[name].where(frame[name].notna() | ~is_normal, 0.0)
@@ -616,12 +616,17 @@ def plot_model(table: Dataset, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
+def _doses(used: Iterable[str], conditions: Iterable[str]) -> list[str]:
+    """Names of a formula that are conditions and no columns of every take."""
+    return sorted({*used} & {*conditions} - {*KEYS, BASELINE})
+
+
 def _conditions(subjects: Subjects, parameters: ModelParameters) -> list[str]:
     """Conditions whose takes a model uses, unless it is of conditions."""
     model = MixedModel.of(parameters.formula)
     used = {*model.names, *model.slopes}
-    words = {*map(str, subjects.attribute(CONDITION).values)}
-    return [] if CONDITION in used else [NORMAL, *sorted(used & words)]
+    doses = _doses(used, map(str, subjects.attribute(CONDITION).values))
+    return [] if CONDITION in used else [NORMAL, *doses]
 
 
 STUDY = Study(
