@@ -149,9 +149,12 @@ def compiling(bench: Bench) -> list[Row]:
 
 
 def reading(bench: Bench) -> list[Row]:
-    """Samples of a capture in the page cache, read by one thread."""
-    db = bench.database()
-    _, results = measure(str(db), skindb.open(db).takes("capture")[0])
+    """Samples of a capture of 150 lights and 16 cameras in the page cache, read by one thread."""
+    size = {"cameras": 16, "lights": 150, "width": 60, "height": 72}
+    [capture] = bench.captures("dome", 1, **size)
+    path = bench.folder / "dome-db"
+    record = ingest_take(skindb.open(path, create=True), capture, spacing_mm=2.0)
+    _, results = measure(str(path), record.take)
     _, speed = results["the store, with digests"]
     _, peer_speed = results["decompression alone"]
     peer = "decompression alone"
