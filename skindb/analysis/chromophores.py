@@ -498,11 +498,12 @@ def describe_chromophores(axes: Dataset) -> list[str]:
 def plot_chromophores(table: Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot mean melanin and haemoglobin of the groups in every region, with 95 % intervals."""
     regions = [name for name in table["region"].values.tolist() if name != "neck"]
-    ax = ax or plots.new_axes(6.5, 1.4 + 0.55 * len(regions))
-    ax.axvline(0, color="0.6", linewidth=1)
     groups = enumerate(table["group"].values.tolist())
     colours = {"melanin": plots.BLUE, "haemoglobin": plots.RED}
     lines = list(itertools.product(groups, colours.items()))
+    height = max(0.55, 0.11 * len(lines))
+    ax = ax or plots.new_axes(6.5, 1.4 + height * len(regions))
+    ax.axvline(0, color="0.6", linewidth=1)
     for i, ((g, group), (name, colour)) in enumerate(lines):
         part = table.sel(group=group, chromophore=name, region=regions)
         count = int(part[variables.GROUP_CHROMOPHORE_COUNT].max())
