@@ -12,6 +12,7 @@ from xarray import Dataset
 
 from skindb import plots
 from skindb.analysis.formula_models import (
+    ALONE,
     RESIDUAL,
     information_of,
     is_constant_within,
@@ -107,8 +108,8 @@ def sample_sizes(
 
     References
     ----------
-    Noncentral t with the degrees of freedom of `linear_model`; Fitzmaurice, Laird and
-    Ware 2011, chapter 20.
+    Noncentral t with the degrees of freedom and errors of `linear_model`; Fitzmaurice,
+    Laird and Ware 2011, chapter 20.
     """
     chosen = PlanParameters(
         formula, term, effect, power, visits, design, doses, drop_out
@@ -143,6 +144,8 @@ def sample_sizes(
     step = people if design == PARALLEL else 1
     counts = np.arange(step, MAX_SUBJECTS + 1, step)
     free = _degrees_of_freedom(x, rows, factors, counts)
+    is_repeated = len(rows) > people
+    excess = np.ones(len(counts)) if is_repeated else _hc3(x, factors, counts)
     needed, errors = [], []
     for between, within in deviations.values:
         subjects = rows[SUBJECT].to_numpy()
@@ -150,10 +153,10 @@ def sample_sizes(
         information = information_of(x, np.ones((len(rows), 1)), [subjects], *variances)
         variance = factors @ np.linalg.solve(information, factors)
         error = np.sqrt(variance * people / counts)
-        enough = np.flatnonzero(_power(effect / error, free) >= power)
+        enough = np.flatnonzero(_power(effect / error, free, excess) >= power)
         arms = counts[enough[0]] / step if len(enough) else np.nan
         needed.append(step * np.ceil(np.round(arms / (1 - drop_out), 6)))
-        errors.append(error[enough[0]] if len(enough) else np.nan)
+        errors.append((error * excess)[enough[0]] if len(enough) else np.nan)
     sources = known[variables.MODEL_SUBJECTS].values
     values = (needed, errors, *deviations.values.T, sources)
     return dataset(
@@ -188,11 +191,25 @@ def _degrees_of_freedom(
     return np.where(is_determined, free[factors != 0].min(axis=0), 0).astype(float)
 
 
-def _power(distance: Array, free: Array) -> Array:
-    """Power of two-sided t tests at 5 % of effects that are `distance` errors from 0."""
+def _hc3(x: Array, factors: Array, counts: Index) -> Array:
+    """Errors HC3, which `linear_model` has without repeats, over those of least squares,
+    with each number of subjects.
+    """
+    inverse = np.linalg.inv(x.T @ x)
+    leverage = np.einsum("ij,jk,ik->i", x, inverse, x) * len(x) / counts[:, None]
+    weights = (x @ inverse @ factors) ** 2
+    square = (1 / np.maximum(1 - leverage, ALONE)) @ weights / weights.sum()
+    return np.asarray(np.sqrt(square))
+
+
+def _power(distance: Array, free: Array, excess: Array) -> Array:
+    """Power of two-sided t tests at 5 % of effects that are `distance` errors from 0, if
+    errors are stated too large by a factor.
+    """
     is_possible = free > 0
     distance = np.clip(distance, -CERTAIN, CERTAIN)
     limit = scipy.stats.t.ppf(1 - SIGNIFICANT / 2, np.where(is_possible, free, 1))
+    limit = limit * excess
     of_sides = [
         scipy.stats.nct.sf(limit, np.where(is_possible, free, 1), side * distance)
         for side in (1, -1)
