@@ -8,7 +8,7 @@ EXECUTED := docs/_build/notebooks
 .PHONY: demo test test-all suite pages readme commands notebooks lint types docs clean
 
 demo: $(STAMP)
-	$(BIN)/skindb demo --out demo
+	$(BIN)/skindb demo --out demo $(DEMO_OPTIONS)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile -m "not slow"
