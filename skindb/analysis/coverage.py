@@ -121,16 +121,19 @@ def _factors(
     names = np.array(takes.names)
     who = np.array(takes.subject)
     factors = {}
-    for name, attribute in stated.items():
+    for name in [*stated, CONDITION]:
+        attribute = takes.attribute(name)
         if name == AGE:
-            factors[AGE_BAND] = _age_bands(attribute.numbers)
-        elif not attribute.is_numeric and 1 <= len(attribute.words) <= MAX_VALUES:
+            factors[AGE_BAND] = _age_bands(stated[name].numbers)
+        elif name == CONDITION or (
+            not attribute.is_numeric and 1 <= len(attribute.words) <= MAX_VALUES
+        ):
             factor = f"attribute {name}" if name in (AGE_BAND, SITE) else name
-            factors[factor] = _indicators(attribute.values)
-    conditions = _indicators(takes.attribute(CONDITION).values)
-    factors[CONDITION] = {
-        name: np.isin(names, who[rows]) for name, rows in conditions.items()
-    }
+            # values may differ between takes of a subject
+            factors[factor] = {
+                value: np.isin(names, who[rows])
+                for value, rows in _indicators(attribute.values).items()
+            }
     if variables.SITE_STATUS in cohort:
         good = cohort[variables.SITE_STATUS].isin(IDENTIFIED).any("channel")
         factors[SITE] = {

@@ -100,6 +100,21 @@ def test_coverage_report__counts_subjects_not_takes(population):
     assert singles == crossed == 36
 
 
+def test_coverage_report__counts_every_value_of_a_subject():
+    report = coverage_report(
+        cohort_of(
+            ["S0", "S0", "S1", "S1"],
+            side=["left", "right", "left", None],
+            dose=[0, 2, 0, 1],
+            phase=[1.0, 3.0, 1.0, 3.0],
+        )
+    )
+    counts = counts_of(report)
+    assert (counts["side: left"], counts["side: right"]) == (2, 1)
+    assert (counts["phase: 1.0"], counts["phase: 3.0"]) == (2, 2)
+    assert not any("dose" in cell for cell in counts)
+
+
 def test_coverage_report__names_empty_and_small_cells(population):
     flags = coverage_report(population).attrs["flags"]
     assert "age band: no subjects in 40-49, 50-59" in flags
