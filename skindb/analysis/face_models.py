@@ -52,6 +52,7 @@ SIZE = 256  # maximum number of texels along each side: 1 mm, the accuracy of la
 LEAST_KNOWN = 0.5  # of the texels that any take has; takes with fewer are skipped
 ALIGNMENTS = 3  # rounds of the alignment of shapes to their mean
 MIN_SUBJECTS = 5  # means of fewer people show individuals
+SAME = 1e-5  # differences of faces over their mean, which rounding explains
 SAMPLES = 1000  # whose distance from the nearest subject is reported
 DIMS = ("quantity", "v", "u")
 MAPS = (variables.FACE_MEAN, variables.FACE_MODE, variables.FACE_SLOPE)
@@ -274,8 +275,9 @@ def _fit(faces: Array, design: Array, blocks: Sequence[Mask], k: int) -> dict[st
     inner = np.stack([_inner(faces[:, rows]) for rows in blocks])
     regressors = np.column_stack([np.ones(n), design - design.mean(axis=0)])
     k = min(k, n - int(np.linalg.matrix_rank(regressors)) - 1)
+    level = SAME * np.array([np.linalg.norm(mean[rows]) for rows in blocks])
     require(
-        n >= MIN_SUBJECTS and k > 0 and (np.trace(inner.T) > 0).all(),
+        n >= MIN_SUBJECTS and k > 0 and (np.trace(inner.T) > level**2).all(),
         "face model",
         f"needs {MIN_SUBJECTS} subjects who differ, and three more than terms",
         f"{n} subjects",

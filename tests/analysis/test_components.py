@@ -299,6 +299,12 @@ def test_face_model__refuses_attributes_that_it_would_ignore(values, said):
         face_model(cohort, adjust=["side"], rng=np.random.default_rng(0))
 
 
+def test_face_model__refuses_copies_of_one_subject():
+    faces = np.repeat(faces_of(np.zeros((1, MODES)), [40]), 6, axis=0)
+    with pytest.raises(InputError, match="needs 5 subjects who differ"):
+        face_model(cohort_of(faces), rng=np.random.default_rng(0))
+
+
 def test_face_model__names_subjects_without_an_attribute():
     ages = [np.nan, *range(30, 39)]
     faces = faces_of(np.random.default_rng(0).normal(size=(10, MODES)), [40] * 10)
