@@ -11,6 +11,7 @@ import scipy  # scipy.stats takes longer to load, at its first use, than command
 from xarray import Dataset
 
 from skindb import plots
+from skindb.analysis.contrasts import MIN_RELIABILITY
 from skindb.analysis.formula_models import (
     ALONE,
     RESIDUAL,
@@ -26,9 +27,9 @@ from skindb.analysis.formulas import (
     sum_of,
     with_levels,
 )
-from skindb.analysis.long_form import INTERCEPT
+from skindb.analysis.long_form import INTERCEPT, tidy
 from skindb.analysis.study import Study, of_cohort, table_of
-from skindb.analysis.subjects import NORMAL
+from skindb.analysis.subjects import CONDITION, NORMAL
 from skindb.errors import require
 from skindb.parameters import require_limits
 from skindb.schema import dataset, variables
@@ -146,8 +147,20 @@ def sample_sizes(
     free = _degrees_of_freedom(x, rows, factors, counts)
     is_repeated = len(rows) > people
     excess = np.ones(len(counts)) if is_repeated else _hc3(x, factors, counts)
+    noise = _noise(cohort.isel(take=first), model)
+    takes = len(rows) // people
+    is_between = is_constant_within(x, rows[SUBJECT].to_numpy())[factors != 0]
     needed, errors = [], []
-    for between, within in deviations.values:
+    flags = list(known.attrs["flags"])
+    for name, (between, within) in zip(
+        known["quantity"].values.tolist(), deviations.values, strict=True
+    ):
+        variance = np.where(is_between, between**2 + within**2 / takes, within**2)
+        error = noise.get(name, np.nan) / np.where(is_between, takes, 1)
+        if (error > (1 - MIN_RELIABILITY) * variance).any():
+            flags.append(
+                f"{name}: errors explain the variance: the model has no p value"
+            )
         subjects = rows[SUBJECT].to_numpy()
         variances = (np.full((1, 1), between**2), [within**2])
         information = information_of(x, np.ones((len(rows), 1)), [subjects], *variances)
@@ -162,8 +175,18 @@ def sample_sizes(
     return dataset(
         dict(zip(COLUMNS, values, strict=True)),
         coords={"quantity": known["quantity"].values},
-        attrs=vars(chosen) | {name: known.attrs[name] for name in ("flags", "skipped")},
+        attrs=vars(chosen) | {"flags": flags, "skipped": known.attrs["skipped"]},
     )
+
+
+def _noise(cohort: Dataset, model: MixedModel) -> dict[str, float]:
+    """Quantity, region and channel -> mean square of the errors that the fits state."""
+    rows = tidy(cohort)
+    rows = rows[(rows["quantity"] == model.quantity) & (rows[CONDITION] == NORMAL)]
+    square = (rows["error"] / (rows["value"] if model.is_log else 1.0)) ** 2
+    channel = (" " + rows["channel"]).fillna("")
+    mean = square.groupby(model.quantity + " " + rows["region"] + channel).mean()
+    return dict(zip(mean.index.tolist(), mean.tolist(), strict=True))
 
 
 def _design(visits: int, design: Design, doses: int) -> pd.DataFrame:

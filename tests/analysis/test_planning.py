@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import xarray as xr
 from matplotlib import pyplot
 from scipy import stats
 from statsmodels.stats.power import TTestIndPower, TTestPower
@@ -188,6 +189,24 @@ def test_sample_sizes__need_repeats(cohort):
             term="treatment",
             effect=1,
         )
+
+
+def test_sample_sizes__flags_quantities_whose_model_has_no_p_value(cohort):
+    """Errors of 0.008 explain most of the variance within subjects, 0.01^2, but not
+    between them; the study that is planned has no p value.
+    """
+    cohort = cohort.copy()
+    cohort["region_diffuse_reflectance_error"] = xr.full_like(
+        cohort["region_diffuse_reflectance"], 0.008
+    )
+    options = {"formula": "R_d ~ visit + (1 | subject)", "term": "visit", "visits": 4}
+    plan = sample_sizes(cohort, effect=0.01, **options)
+    flag = f"{NAME}: errors explain the variance: the model has no p value"
+    assert flag in plan.attrs["flags"]
+    fitted = linear_model(cohort, formula=options["formula"])
+    assert fitted["model_p"].sel(quantity=NAME, term="visit").isnull()
+    options = {"formula": "R_d ~ treatment + (1 | subject)", "term": "treatment"}
+    assert not sample_sizes(cohort, effect=0.01, **options).attrs["flags"]
 
 
 def test_sample_sizes__repeats_are_no_visits(cohort):
