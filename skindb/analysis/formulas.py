@@ -112,6 +112,8 @@ def with_levels(model: MixedModel, frame: pd.DataFrame) -> pd.DataFrame:
         is_number = pd.api.types.is_numeric_dtype(values)
         if is_number and name not in model.factors:
             continue
+        if is_number and (values % 1 == 0).all():
+            values = values.astype(int)  # level 2 is "2", not "2.0"
         kinds = sorted({type(value).__name__ for value in values})
         require(
             len(kinds) < 2,

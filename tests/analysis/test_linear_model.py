@@ -711,3 +711,11 @@ def test_linear_model__of_a_dose_that_is_a_condition_contains_even_reflection(
     # variances differ a little, as the raised values are not those of one dose
     np.testing.assert_allclose(half, np.hypot(added, known), rtol=1e-2)
     assert np.isnan(one["model_p"])
+
+
+def test_linear_model__levels_of_whole_numbers_have_no_fraction():
+    cohort = planted_tables(
+        [f"S{i:02d}" for i in range(18)], dose=[float(i % 3) for i in range(18)]
+    )
+    terms = linear_model(cohort, formula="R_d ~ C(dose)")["term"].values.tolist()
+    assert terms == ["Intercept", "dose[T.1]", "dose[T.2]"]
