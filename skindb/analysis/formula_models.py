@@ -180,19 +180,22 @@ def _even_reflection(
     flags = []
     # a unit for each condition, independent of the others
     squares = {name: np.zeros(len(fit.table)) for name, fit in fits.items()}
-    conditions = {*cohort[CONDITION].values.tolist()}
-    if model.quantity in QUANTITIES and NORMAL in conditions:
+    conditions = sorted({name for fit in fits.values() for name in fit.shifts})
+    is_normal = cohort[CONDITION].values == NORMAL
+    if conditions and model.quantity in QUANTITIES and is_normal.any():
         quantities = quantities_of(cohort, (model.quantity,))
-        normal = quantities.select(np.flatnonzero(cohort[CONDITION].values == NORMAL))
-        level = np.abs(known_mean(normal.values)) if model.is_log else 1.0
-        for condition in sorted(conditions - {NORMAL}):
+        normal = quantities.values[is_normal]
+        level = np.abs(known_mean(normal)) if model.is_log else np.ones(normal.shape[1])
+        for condition in conditions:
             errors = even_errors(cohort, quantities, condition) / level
-            for name, error in zip(quantities.names, errors, strict=True):
+            # not known where no normal take has a value
+            known = np.nan_to_num(errors)
+            for name, error in zip(quantities.names, known, strict=True):
                 if name in fits and condition in fits[name].shifts:
                     squares[name] += (fits[name].shifts[condition] * error) ** 2
     for name, fit in fits.items():
         for row, error in zip(fit.table.index, np.sqrt(squares[name]), strict=True):
-            if _widen(fit.table, row, error, margin):
+            if error and _widen(fit.table, row, error, margin):
                 flags.append(f"{name}: even reflection may cause the effect of {row}")
     return flags
 

@@ -719,3 +719,21 @@ def test_linear_model__levels_of_whole_numbers_have_no_fraction():
     )
     terms = linear_model(cohort, formula="R_d ~ C(dose)")["term"].values.tolist()
     assert terms == ["Intercept", "dose[T.1]", "dose[T.2]"]
+
+
+def test_linear_model__a_region_that_no_normal_take_has_keeps_its_intervals():
+    conditions = np.repeat(["normal", "lotion"], 12)
+    cohort = planted_tables(
+        [f"S{i:02d}" for i in range(24)],
+        conditions=conditions.tolist(),
+        lotion=[*np.full(12, np.nan), *np.tile([1.0, 2.0], 6)],
+    )
+    values = cohort["region_diffuse_reflectance"]
+    is_normal = xr.DataArray(conditions == "normal", dims="take")
+    lacking = is_normal & (cohort["region"] == "beard")
+    found = linear_model(
+        cohort.assign(region_diffuse_reflectance=values.where(~lacking)),
+        formula="log(R_d) ~ lotion",
+    )
+    for end in ("model_estimate_low", "model_estimate_high"):
+        assert found[end].sel(quantity=["R_d face G", "R_d beard G"]).notnull().all()
